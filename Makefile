@@ -1,0 +1,32 @@
+# One environment (.venv), made on demand. `make install TORCH=` keeps the torch that is already in it.
+PYTHON ?= python3.11
+TORCH ?= torch==2.13.0
+BIN = .venv/bin
+
+.PHONY: install demo test check lint clean
+
+install: .venv/.installed
+
+.venv/.installed: pyproject.toml constraints-cpu.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(if $(TORCH),$(BIN)/pip install --quiet '$(TORCH)',$(BIN)/python -c 'import torch')
+	$(BIN)/pip install --quiet $(if $(TORCH),-c constraints-cpu.txt) -e '.[pipeline,dev]'
+	touch $@
+
+demo: install
+	$(BIN)/presight --workspace demo demo
+
+test: install
+	$(BIN)/python -m pytest
+
+check: lint
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+clean:
+	rm -rf .venv build dist *.egg-info

@@ -1,0 +1,5 @@
+"""The `presight` command."""
+
+
+def main() -> None:
+    """Run the command line."""

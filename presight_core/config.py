@@ -1,0 +1,252 @@
+"""Settings: frozen models, presets, a TOML file per city, overrides from the command line.
+
+Values are resolved in this order, later ones win: the preset, the city's TOML, `--set` overrides.
+An unknown name is an error that names the file, the field and the nearest valid name.
+"""
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from presight_core import classes
+from presight_core.errors import SettingsError
+
+PRESETS = ("demo", "fast", "default", "paper")
+
+Count = Annotated[int, Field(gt=0)]
+Metres = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class Settings(BaseModel):
+    """Base of all settings: immutable, and no unknown names."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class FeatureSettings(Settings):
+    """How images become label maps and features."""
+
+    masks: Literal["auto", "precomputed", "model"] = "auto"  # auto: `segmentation/` of the data set where present
+    segmentation_model: str = "tiny"  # name of a shipped model, or path of a model card
+    feature_model: str = "tiny"  # likewise
+    channels: Count = 64  # of the shared feature space; a model with fewer channels gives fewer
+    sample_patches: Count = 200_000  # patches that the feature space is fitted on
+    dynamic_classes: tuple[str, ...] = classes.DYNAMIC
+
+
+class TilingSettings(Settings):
+    """How a city is cut into tiles, and a tile into sub-fields."""
+
+    tile_count: Count | None = None  # None: from the mapped area
+    tile_area_km2: Metres = 1.0  # paper, section 3.2
+    overlap_m: Annotated[float, Field(ge=0)] = 30.0  # frames this far outside a tile's cell still train it
+    sub_field_count: Count = 8  # paper: 8 or 16 a tile
+    box_quantile: Annotated[float, Field(ge=0, lt=0.5)] = 0.05  # box = 5..95 % of the member cameras (released code)
+    box_margin_xy_m: Metres = 15.0
+    box_margin_below_m: Metres = 5.0
+    box_margin_above_m: Metres = 15.0
+    seed: int = 0
+
+
+class GridSettings(Settings):
+    """One multi-resolution hash grid."""
+
+    levels: Count
+    features_per_level: Count
+    min_resolution: Count = 16
+    max_resolution: Count
+    log2_rows: Annotated[int, Field(ge=4, le=24)]
+
+
+class FieldSettings(Settings):
+    """The scene representation of a tile (paper, section 3.2 and released code)."""
+
+    grid: GridSettings = GridSettings(levels=10, features_per_level=4, max_resolution=16384, log2_rows=20)
+    proposals: tuple[GridSettings, ...] = (
+        GridSettings(levels=8, features_per_level=1, max_resolution=1024, log2_rows=20),
+        GridSettings(levels=8, features_per_level=1, max_resolution=4096, log2_rows=20),
+    )
+    hidden_width: Count = 64
+    geometry_channels: Count = 15
+    video_embedding: Count = 12
+    image_embedding: Annotated[int, Field(ge=0)] = 4
+    density_bias: float = -4.0  # metres; the released code's poses are scaled by 0.05 (findings B)
+
+
+class SamplingSettings(Settings):
+    """Where samples lie along a ray. Spacing is linear up to `linear_m`, then in disparity."""
+
+    near_m: Metres = 0.1
+    far_m: Metres = 1000.0
+    linear_m: Metres = 100.0
+    proposal_samples: tuple[Count, ...] = (128, 64)
+    field_samples: Count = 64
+
+
+class LossSettings(Settings):
+    """Weights of the five losses besides rgb, whose weight is 1 (paper, section 3.2)."""
+
+    features: float = 0.5
+    sky: float = 0.001
+    interlevel: float = 1.0
+    distortion: float = 0.002
+
+
+class TrainingSettings(Settings):
+    """How a tile's field is optimised."""
+
+    steps: Count = 100_000
+    batch_rays: Count = 65_536
+    learning_rate: Metres = 0.01
+    warmup: Share = 0.1  # share of the steps with rising learning rate
+    decay_at: tuple[Share, ...] = (0.25, 0.5, 0.75)
+    decay: Share = 0.33
+    weight_decay: float = 1e-5  # not on hash tables
+    anneal: Share = 0.1  # share of the steps over which proposal weights sharpen
+    image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
+    keyframes_only: bool = False
+    holdout_every: Annotated[int, Field(ge=0)] = 8  # every 8th frame of a camera is kept for evaluation; 0: none
+    bfloat16: bool = True  # multilayer perceptrons; 1.5 times faster on a CPU
+    checkpoint_every: Count = 2000
+    seed: int = 0
+    loss: LossSettings = LossSettings()
+
+
+class ExtractionSettings(Settings):
+    """How a trained field becomes voxels."""
+
+    surface: Literal["first-hit", "expected"] = "first-hit"  # paper: first-hit; released code: expected depth
+    frame_stride: Count = 8  # every n-th training frame of a camera
+    pixel_stride: Count = 5
+    min_depth_m: Metres = 0.5
+    max_depth_m: Metres = 50.0
+    below_camera_m: Metres = 3.0
+    above_camera_m: Metres = 6.0
+    min_density: float = 0.05  # per metre; mean of the three networks (1.0 in the released code's scaled units)
+    min_hits: Count = 2  # released code drops voxels with the minimum hit count
+
+
+class ValidationSettings(Settings):
+    """What a new tile must show before it may be published."""
+
+    min_voxels: Count = 100
+    min_psnr_db: float = 12.0  # held-out; below this the field shows nothing recognisable
+    min_coverage: Share = 0.8  # share of the old tile's observed columns that the new one must keep
+
+
+class CitySettings(Settings):
+    """Everything that decides a city's priors."""
+
+    preset: Literal["demo", "fast", "default", "paper"] = "default"
+    features: FeatureSettings = FeatureSettings()
+    tiling: TilingSettings = TilingSettings()
+    field: FieldSettings = FieldSettings()
+    sampling: SamplingSettings = SamplingSettings()
+    training: TrainingSettings = TrainingSettings()
+    extraction: ExtractionSettings = ExtractionSettings()
+    validation: ValidationSettings = ValidationSettings()
+
+
+class WorkspaceSettings(Settings):
+    """Where things are kept: `presight.toml` of the workspace. None stands for a folder of the workspace."""
+
+    catalog: str | None = None  # SQLAlchemy URL
+    store: str | None = None  # folder or object-store URL of the prior store
+    caches: str | None = None  # folder for frames, features and training scratch
+
+
+SettingsType = TypeVar("SettingsType", bound=Settings)
+
+
+def load_city_settings(file: Path | None, overrides: Iterable[str] = ()) -> CitySettings:
+    """Settings of a city from its preset, its TOML file (may be absent) and `key=value` overrides.
+
+    Raises SettingsError for an unreadable file, an unknown name or a value out of range.
+    """
+    chosen = read_toml(file) if file is not None and file.exists() else {}
+    source = str(file) if chosen else "the defaults"
+    for override in overrides:
+        _set(chosen, override)
+        source = f"{source} with --set"
+    preset = chosen.get("preset", "default")
+    if preset not in PRESETS:
+        raise SettingsError(f"{source}: preset: {preset!r} is unknown; choose one of {', '.join(PRESETS)}")
+    return validate(CitySettings, _merge(_preset(preset), chosen), source)
+
+
+def load_workspace_settings(file: Path) -> WorkspaceSettings:
+    """Settings of a workspace from `presight.toml`; an absent file gives the defaults."""
+    return validate(WorkspaceSettings, read_toml(file) if file.exists() else {}, str(file))
+
+
+def read_toml(file: Path) -> dict[str, Any]:
+    """The table of a TOML file. Raises SettingsError if it cannot be read or parsed."""
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SettingsError(f"{file}: {error}; correct the file") from error
+
+
+def validate(model: type[SettingsType], values: Mapping[str, Any], source: str) -> SettingsType:
+    """The settings model filled with `values`; `source` is named in every error."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        problems = "; ".join(_explain(model, problem) for problem in error.errors())
+        raise SettingsError(f"{source}: {problems}") from None
+
+
+def _preset(name: str) -> dict[str, Any]:
+    text = resources.files("presight_core").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
+def _merge(base: dict[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in top.items():
+        below = merged.get(key)
+        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
+    return merged
+
+
+def _set(values: dict[str, Any], override: str) -> None:
+    """Put `a.b=value` into nested `values`; the value is TOML, or a bare string."""
+    key, separator, text = override.partition("=")
+    if not separator:
+        raise SettingsError(f"--set {override}: no '='; write --set section.name=value")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *sections, name = key.strip().split(".")
+    for section in sections:
+        values = values.setdefault(section, {})
+        if not isinstance(values, dict):
+            raise SettingsError(f"--set {override}: {section} is a value, not a section")
+    values[name] = value
+
+
+def _explain(model: type[BaseModel], problem: Any) -> str:
+    """One pydantic error as `field: fact; cure`."""
+    path = [str(part) for part in problem["loc"]]
+    if problem["type"] != "extra_forbidden":
+        return f"{'.'.join(path)}: {problem['msg']} (got {problem['input']!r})"
+    names = _field_names(model, path[:-1])
+    near = difflib.get_close_matches(path[-1], names, n=1)
+    cure = f"did you mean {near[0]}?" if near else f"valid names: {', '.join(names)}"
+    return f"{'.'.join(path)}: unknown setting; {cure}"
+
+
+def _field_names(model: type[BaseModel], path: list[str]) -> list[str]:
+    for part in path:
+        annotation = model.model_fields[part].annotation if part in model.model_fields else None
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            break
+        model = annotation
+    return sorted(model.model_fields)
