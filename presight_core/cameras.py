@@ -36,7 +36,7 @@ class Camera:
     def sees(self, points_world: ArrayLike) -> NDArray[np.bool_]:
         """Which world points (N, 3) fall inside the image, occlusion left aside."""
         pixels, _ = self.project(points_world)
-        return ((pixels >= 0) & (pixels < [self.width_px, self.height_px])).all(-1)
+        return np.all((pixels >= 0) & (pixels < [self.width_px, self.height_px]), axis=-1)
 
     def rays(self, pixels: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Origin (3,) and unit directions (N, 3), both world, of the rays through pixels (N, 2)."""
@@ -66,4 +66,4 @@ def pixel_centres(width_px: int, height_px: int, stride: int = 1) -> NDArray[np.
     """Centres (rows * columns, 2) of every `stride`-th pixel, row by row, taken from the middle of each stride."""
     x = np.arange(stride // 2, width_px, stride) + 0.5
     y = np.arange(stride // 2, height_px, stride) + 0.5
-    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(np.float64)

@@ -1,0 +1,8 @@
+"""Versions of the stages: raise a stage's number in the commit that changes its results.
+
+A raised number makes every tile built with the old one stale.
+"""
+
+FEATURES = 1
+TRAINING = 1
+EXTRACTION = 1
