@@ -1,0 +1,149 @@
+"""The drive index: one Parquet file a drive, a row a frame, with the drive and its rejects in the file's metadata.
+
+The catalog can be made again from it.
+"""
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import parquet
+
+from presight_core.drives import Drive, FrameTable, Reject
+from presight_core.errors import NotFoundError, StoreError
+
+FORMAT = 1  # of the columns and metadata below
+METADATA_KEY = b"presight"
+SHAPES = {"intrinsics": (3, 3), "world_from_camera": (4, 4)}  # matrices are stored as fixed-size lists, row by row
+TEXTS = ("drive_id", "camera", "path")
+
+
+class DriveIndex:
+    """Frames of drives, in a folder. Writers and readers may be many: a file appears whole or not at all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def add(self, drive: Drive, frames: FrameTable, rejects: Sequence[Reject] = ()) -> None:
+        """Write a drive's file, unless the same is there already. Raises StoreError if the disk refuses."""
+        if self._has_same(drive, rejects):
+            return
+        description = {"format": FORMAT, "drive": asdict(drive), "rejects": [asdict(reject) for reject in rejects]}
+        table = _to_arrow(frames).replace_schema_metadata({METADATA_KEY: json.dumps(description).encode()})
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            _write_whole(table, self._file(drive.drive_id))
+        except OSError as error:
+            raise StoreError(f"{self.folder}: drive {drive.name} not written: {error}; free the disk") from error
+
+    def frames(self, drive_id: str) -> FrameTable:
+        """The frames of a drive, ordered by camera and time. Raises NotFoundError, or StoreError if damaged."""
+        file = self._existing(drive_id)
+        try:
+            return _from_arrow(parquet.read_table(file, columns=[field.name for field in fields(FrameTable)]))
+        except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+            raise _damaged(file, error) from error
+
+    def drives(self) -> list[Drive]:
+        """Every drive of the index, by id."""
+        return [self.drive(file.stem) for file in sorted(self.folder.glob("*.parquet"))]
+
+    def drive(self, drive_id: str) -> Drive:
+        """One drive. Raises NotFoundError, or StoreError if its file is damaged."""
+        return Drive(**self._description(drive_id)["drive"])
+
+    def rejects(self, drive_id: str) -> tuple[Reject, ...]:
+        """What ingest refused of a drive."""
+        return tuple(Reject(**reject) for reject in self._description(drive_id)["rejects"])
+
+    def remove(self, drive_id: str) -> None:
+        """Delete a drive's file, if there is one."""
+        self._file(drive_id).unlink(missing_ok=True)
+
+    def _has_same(self, drive: Drive, rejects: Sequence[Reject]) -> bool:
+        try:
+            return self.drive(drive.drive_id) == drive and self.rejects(drive.drive_id) == tuple(rejects)
+        except (NotFoundError, StoreError):
+            return False
+
+    def _description(self, drive_id: str) -> dict:
+        file = self._existing(drive_id)
+        try:
+            description = json.loads(parquet.read_schema(file).metadata[METADATA_KEY])
+        except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
+            raise _damaged(file, error) from error
+        if description["format"] != FORMAT:
+            raise StoreError(f"{file}: format {description['format']}, not {FORMAT}; ingest the drive again")
+        return description
+
+    def _existing(self, drive_id: str) -> Path:
+        file = self._file(drive_id)
+        if not file.is_file():
+            raise NotFoundError(f"{self.folder}: no drive {drive_id}; run `presight ingest` for its data set")
+        return file
+
+    def _file(self, drive_id: str) -> Path:
+        if not drive_id.isalnum():
+            raise NotFoundError(f"{drive_id!r} is not a drive id; use one that `presight status` lists")
+        return self.folder / f"{drive_id}.parquet"
+
+
+def _damaged(file: Path, error: Exception) -> StoreError:
+    fact = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return StoreError(f"{file}: damaged ({fact}); delete it and ingest the drive again")
+
+
+def _to_arrow(frames: FrameTable) -> pa.Table:
+    return pa.table({field.name: _column(field.name, getattr(frames, field.name)) for field in fields(FrameTable)})
+
+
+def _column(name: str, values: NDArray) -> pa.Array:
+    if name in TEXTS:
+        return pa.array(values.tolist(), pa.string())
+    if name in SHAPES:
+        size = int(np.prod(SHAPES[name]))
+        return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), size)
+    return pa.array(values)
+
+
+def _from_arrow(table: pa.Table) -> FrameTable:
+    return FrameTable(**{field.name: _values(field.name, table.column(field.name)) for field in fields(FrameTable)})
+
+
+def _values(name: str, column: pa.ChunkedArray) -> NDArray:
+    array = column.combine_chunks()
+    if name in TEXTS:
+        return np.array(array.to_pylist(), np.str_)
+    if name in SHAPES:
+        return np.array(array.flatten()).reshape(-1, *SHAPES[name])
+    return np.array(array)  # a copy: Arrow's own memory is read-only, which torch warns about
+
+
+def _write_whole(table: pa.Table, file: Path) -> None:
+    """Write beside the file, force it to the disk, then put it in place: a crash leaves the old or the new."""
+    part = file.with_name(f".{file.stem}-{uuid4().hex}.part")
+    try:
+        with part.open("xb") as target:
+            parquet.write_table(table, target, compression="zstd")
+            target.flush()
+            os.fsync(target.fileno())
+        part.replace(file)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    _force_to_disk(file.parent)
+
+
+def _force_to_disk(folder: Path) -> None:
+    """Make a rename in the folder survive a loss of power."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
