@@ -1,0 +1,258 @@
+"""The catalog: which drives, tilings and builds there are. It holds the truth; everything else shows it.
+
+Safe for many threads and processes at once. Time comes from the catalog's own clock; nothing else reads one.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal
+
+from presight_core.errors import ConflictError, InputError, NotFoundError
+from storage.database import Database, Query, open_database
+from storage.migrations import HEAD
+
+if TYPE_CHECKING:  # these import numpy, which `presight status` has no time for
+    from presight_core.drives import Drive, Reject
+    from presight_core.progress import Progress
+    from presight_core.recipes import Recipe
+    from presight_core.tiles import Tiling
+
+Clock = Callable[[], datetime]
+Ending = Literal["built", "published", "failed"]
+
+
+@dataclass(frozen=True)
+class Build:
+    """One attempt to build a tile. Times are UTC, ISO 8601."""
+
+    build_id: int
+    city: str
+    tile_id: str
+    recipe: dict[str, Any]
+    recipe_digest: str
+    state: str  # "running", then "built" or "failed"; "published" after "built"
+    stage: str  # what it does, or did last
+    done: int
+    total: int  # 0: not yet known
+    figures: dict[str, float]  # of the stage: loss, rays/s
+    metrics: dict[str, Any]  # of the result
+    error: str  # of a failed build
+    started_at: str
+    updated_at: str
+    finished_at: str | None
+
+
+def utc_now() -> datetime:
+    """The time of day."""
+    return datetime.now(UTC)
+
+
+class Catalog:
+    """Drives, tilings and builds in one database."""
+
+    def __init__(self, database: Database, clock: Clock = utc_now) -> None:
+        self._database = database
+        self._clock = clock
+
+    @staticmethod
+    def open(url: str, clock: Clock = utc_now) -> "Catalog":
+        """The catalog at a SQLAlchemy URL, made or brought up to date if need be.
+
+        Raises StoreError if it cannot be reached, is damaged, or was made by a newer version.
+        """
+        database = open_database(url)
+        if database.revision() != HEAD:
+            from storage.migrations.upgrade import upgrade
+
+            upgrade(database)
+        return Catalog(database, clock)
+
+    def add_drive(self, drive: "Drive", rejects: "Sequence[Reject]" = ()) -> bool:
+        """Record a drive and what was refused of it; False if it is there already, then only its place is updated.
+
+        A drive of the same scene, root and version with other content is replaced: it is removed from its city.
+        Raises InputError for a drive without frames.
+        """
+        if not drive.frame_count:
+            raise InputError(f"{drive.name}: no good frame; correct what its rejects name and ingest it again")
+        with self._database.writing() as query:
+            known = query("SELECT removed_at FROM drives WHERE drive_id = :drive_id", drive_id=drive.drive_id)
+            self._remove(query, "root = :root AND version = :version AND name = :name AND drive_id <> :drive_id", drive)
+            if known:
+                query(REPLACE_DRIVE, **asdict(drive))
+                return known[0]["removed_at"] is not None
+            query(ADD_DRIVE, **asdict(drive), added_at=self._now())
+            _add_rejects(query, drive.drive_id, rejects)
+            return True
+
+    def remove_drive(self, drive_id: str) -> None:
+        """Take a drive out of its city; its record stays. Raises NotFoundError if there is none."""
+        with self._database.writing() as query:
+            if not query("SELECT 1 FROM drives WHERE drive_id = :drive_id", drive_id=drive_id):
+                raise NotFoundError(f"no drive {drive_id}; `presight status` lists what there is")
+            query(REMOVE_DRIVES + "drive_id = :drive_id", drive_id=drive_id, now=self._now())
+
+    def drives(self, city: str | None = None) -> "list[Drive]":
+        """The drives of a city, or of all, by capture time."""
+        from presight_core.drives import Drive
+
+        names = ", ".join(field.name for field in fields(Drive))
+        with self._database.reading() as query:
+            rows = query(
+                f"SELECT {names} FROM drives WHERE removed_at IS NULL AND city = COALESCE(:city, city)"
+                " ORDER BY start_us, drive_id",
+                city=city,
+            )
+        return [Drive(**row) for row in rows]
+
+    def cities(self) -> list[str]:
+        """Every city with a drive, sorted."""
+        with self._database.reading() as query:
+            return sorted(row["city"] for row in query("SELECT DISTINCT city FROM drives WHERE removed_at IS NULL"))
+
+    def add_rejects(self, drive_id: str, rejects: "Sequence[Reject]") -> None:
+        """Record what a later stage refused of a drive; what is recorded already is not recorded twice."""
+        with self._database.writing() as query:
+            known = {tuple(row.values()) for row in query(REJECTS_OF_DRIVE, drive_id=drive_id)}
+            new = [reject for reject in rejects if (reject.code, reject.file, reject.detail) not in known]
+            _add_rejects(query, drive_id, new)
+
+    def rejects(self, city: str | None = None) -> "list[Reject]":
+        """What was refused of the drives of a city, or of all."""
+        from presight_core.drives import Reject
+
+        with self._database.reading() as query:
+            return [Reject(**row) for row in query(REJECTS_OF_CITY, city=city)]
+
+    def save_tiling(self, tiling: "Tiling", settings: Mapping[str, Any]) -> None:
+        """Record a tiling, or append its new tiles to the recorded one. The newest tiling is its city's.
+
+        Raises ConflictError if a recorded tile would move or vanish.
+        """
+        with self._database.writing() as query:
+            known = query(FIND_TILING, city=tiling.city, tiling_id=tiling.tiling_id)
+            if known:
+                number, tiles = known[0]["tiling_number"], query(TILES, number=known[0]["tiling_number"])
+            else:
+                tiles = []
+                number = query(
+                    ADD_TILING,
+                    city=tiling.city,
+                    tiling_id=tiling.tiling_id,
+                    settings=json.dumps(settings, sort_keys=True),
+                    created_at=self._now(),
+                )[0]["tiling_number"]
+            _require_unmoved(tiling, tiles)
+            for place, tile in enumerate(tiling.tiles[len(tiles) :], start=len(tiles)):
+                x_m, y_m = (float(value) for value in tile.centroid_m)
+                query(ADD_TILE, number=number, place=place, tile_id=tile.tile_id, x_m=x_m, y_m=y_m)
+
+    def tiling(self, city: str) -> "Tiling | None":
+        """The city's tiling, if it has one."""
+        from presight_core.tiles import Tile, Tiling
+
+        with self._database.reading() as query:
+            newest = query(NEWEST_TILING, city=city)
+            if not newest:
+                return None
+            rows = query(TILES, number=newest[0]["tiling_number"])
+        tiles = tuple(Tile(row["tile_id"], (row["x_m"], row["y_m"])) for row in rows)
+        return Tiling(newest[0]["tiling_id"], city, tiles)
+
+    def tiling_settings(self, city: str) -> dict[str, Any]:
+        """The settings that the city's tiling was made with; empty if it has none."""
+        with self._database.reading() as query:
+            newest = query(NEWEST_TILING, city=city)
+        return json.loads(newest[0]["settings"]) if newest else {}
+
+    def start_build(self, city: str, tile_id: str, recipe: "Recipe") -> int:
+        """Record the start of a build; its id."""
+        values = {"city": city, "tile_id": tile_id, "recipe": json.dumps(recipe.to_json()), "digest": recipe.digest}
+        with self._database.writing() as query:
+            return query(START_BUILD, **values, now=self._now())[0]["build_id"]
+
+    def progress(self, build_id: int, progress: "Progress") -> None:
+        """Record where a running build is; a build that has ended stays as it is."""
+        values = {"stage": progress.stage, "done": int(progress.done), "total": int(progress.total)}
+        with self._database.writing() as query:
+            query(PROGRESS, build_id=build_id, **values, figures=json.dumps(progress.figures), now=self._now())
+
+    def finish_build(
+        self, build_id: int, state: Ending, metrics: Mapping[str, Any] | None = None, error: str = ""
+    ) -> None:
+        """Record a build's end. `metrics` None leaves those recorded before. Raises NotFoundError for no such build."""
+        encoded = None if metrics is None else json.dumps(dict(metrics))
+        with self._database.writing() as query:
+            values = {"build_id": build_id, "state": state, "metrics": encoded, "error": error}
+            if not query(FINISH_BUILD, **values, now=self._now()):
+                raise NotFoundError(f"no build {build_id}; start it with start_build")
+
+    def builds(self, city: str, state: str | None = None) -> list[Build]:
+        """The latest build of every tile of a city, by tile; of those in `state`, if given."""
+        with self._database.reading() as query:
+            rows = query(LATEST_BUILDS, city=city, state=state)
+        return [_build(row) for row in rows]
+
+    def _remove(self, query: Query, which: str, drive: "Drive") -> None:
+        query(REMOVE_DRIVES + which, **asdict(drive), now=self._now())
+
+    def _now(self) -> str:
+        return self._clock().astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+
+
+def _add_rejects(query: Query, drive_id: str, rejects: "Sequence[Reject]") -> None:
+    for reject in rejects:
+        query(ADD_REJECT, drive_id=drive_id, **asdict(reject))
+
+
+def _require_unmoved(tiling: "Tiling", rows: list[dict[str, Any]]) -> None:
+    recorded = [(row["tile_id"], row["x_m"], row["y_m"]) for row in rows]
+    given = [(tile.tile_id, *tile.centroid_m) for tile in tiling.tiles]
+    if given[: len(recorded)] != recorded:
+        fact = f"{tiling.city}: tiling {tiling.tiling_id} would move or drop tiles that it has"
+        raise ConflictError(f"{fact}; append tiles only, or make a new tiling")
+
+
+def _build(row: Mapping[str, Any]) -> Build:
+    return Build(**{**row, **{name: json.loads(row[name]) for name in ("recipe", "figures", "metrics")}})
+
+
+ADD_DRIVE = """
+    INSERT INTO drives (drive_id, name, city, root, version, captured, frame_count, start_us, end_us, added_at)
+    VALUES (:drive_id, :name, :city, :root, :version, :captured, :frame_count, :start_us, :end_us, :added_at)"""
+REPLACE_DRIVE = """
+    UPDATE drives SET name = :name, root = :root, version = :version, captured = :captured, removed_at = NULL
+    WHERE drive_id = :drive_id"""
+REMOVE_DRIVES = "UPDATE drives SET removed_at = :now WHERE removed_at IS NULL AND "
+ADD_REJECT = """
+    INSERT INTO rejects (drive_id, code, file, detail, cure, drive)
+    VALUES (:drive_id, :code, :file, :detail, :cure, :drive)"""
+REJECTS_OF_DRIVE = "SELECT code, file, detail FROM rejects WHERE drive_id = :drive_id"
+REJECTS_OF_CITY = """
+    SELECT code, file, detail, cure, drive FROM rejects WHERE drive_id IN
+    (SELECT drive_id FROM drives WHERE removed_at IS NULL AND city = COALESCE(:city, city)) ORDER BY reject_id"""
+FIND_TILING = "SELECT tiling_number FROM tilings WHERE city = :city AND tiling_id = :tiling_id"
+NEWEST_TILING = "SELECT * FROM tilings WHERE city = :city ORDER BY tiling_number DESC LIMIT 1"
+ADD_TILING = """
+    INSERT INTO tilings (city, tiling_id, settings, created_at)
+    VALUES (:city, :tiling_id, :settings, :created_at) RETURNING tiling_number"""
+TILES = "SELECT tile_id, x_m, y_m FROM tiles WHERE tiling_number = :number ORDER BY place"
+ADD_TILE = """
+    INSERT INTO tiles (tiling_number, place, tile_id, x_m, y_m) VALUES (:number, :place, :tile_id, :x_m, :y_m)"""
+START_BUILD = """
+    INSERT INTO builds (city, tile_id, recipe, recipe_digest, state, stage, done, total, figures, metrics, error,
+                        started_at, updated_at)
+    VALUES (:city, :tile_id, :recipe, :digest, 'running', '', 0, 0, '{}', '{}', '', :now, :now) RETURNING build_id"""
+PROGRESS = """
+    UPDATE builds SET stage = :stage, done = :done, total = :total, figures = :figures, updated_at = :now
+    WHERE build_id = :build_id AND state = 'running'"""
+FINISH_BUILD = """
+    UPDATE builds SET state = :state, metrics = COALESCE(:metrics, metrics), error = :error, updated_at = :now,
+                      finished_at = :now
+    WHERE build_id = :build_id RETURNING build_id"""
+LATEST_BUILDS = """
+    SELECT * FROM builds WHERE build_id IN
+    (SELECT MAX(build_id) FROM builds WHERE city = :city AND state = COALESCE(:state, state) GROUP BY tile_id)
+    ORDER BY tile_id"""
