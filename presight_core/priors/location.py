@@ -1,0 +1,88 @@
+"""Where priors are read from: a folder or an object-store URL.
+
+Folders are read without obstore. Its threads do not survive a fork, and data loaders fork.
+"""
+
+import os
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import obstore
+from obstore.exceptions import BaseError
+from obstore.store import ObjectStore as RemoteStore
+from obstore.store import from_url
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import LocalStore, ObjectStore, WrapperStore
+
+from presight_core.errors import StoreError
+
+_remote_pid: list[int] = []  # the process that first reached an object store; a fork of it cannot
+
+
+def local_folder(location: str | Path) -> Path | None:
+    """The folder that a path or a file:// URL names; None for another URL."""
+    if isinstance(location, Path) or "://" not in location:
+        return Path(location)
+    parts = urlsplit(location)
+    return Path(unquote(parts.path)) if parts.scheme == "file" else None
+
+
+class ReadLocation:
+    """Read access to a folder or URL. Raises StoreError where it cannot be reached."""
+
+    def __init__(self, location: str | Path) -> None:
+        self._name = str(location)
+        self._place = local_folder(location) or _remote_store(self._name)
+
+    def __str__(self) -> str:
+        return self._name
+
+    def read(self, path: str) -> bytes | None:
+        """The content of one object; None if there is none."""
+        try:
+            if isinstance(self._place, Path):
+                return (self._place / path).read_bytes()
+            return bytes(obstore.get(self._place, path).bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, BaseError) as error:
+            raise StoreError(f"{self._name}/{path}: {error}; check the location and your access to it") from error
+
+    def names(self, folder: str) -> list[str]:
+        """Names of the objects directly in a folder; empty if there is none."""
+        try:
+            if isinstance(self._place, Path):
+                return sorted(entry.name for entry in (self._place / folder).iterdir() if entry.is_file())
+            objects = obstore.list_with_delimiter(self._place, folder)["objects"]
+            return sorted(entry["path"].rpartition("/")[2] for entry in objects)
+        except FileNotFoundError:
+            return []
+        except (OSError, BaseError) as error:
+            raise StoreError(f"{self._name}/{folder}: {error}; check the location and your access to it") from error
+
+    def zarr_store(self) -> Store:
+        """A read-only Zarr store of the location, in which a lost chunk is an error."""
+        if isinstance(self._place, Path):
+            return _NoChunkMayBeAbsent(LocalStore(self._place, read_only=True))
+        return _NoChunkMayBeAbsent(ObjectStore(self._place, read_only=True))
+
+
+class _NoChunkMayBeAbsent(WrapperStore[Store]):
+    """Zarr reads an absent chunk as its fill value, which would be an empty road. Every chunk is written, so raise."""
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        content = await super().get(key, prototype, byte_range)
+        if content is None and not key.endswith("zarr.json"):
+            raise StoreError(f"chunk {key} is missing")
+        return content
+
+
+def _remote_store(url: str) -> RemoteStore:
+    if _remote_pid and _remote_pid[0] != os.getpid():
+        raise StoreError(f"{url}: cannot be read in a forked process; start workers with 'spawn' or 'forkserver'")
+    _remote_pid[:] = [os.getpid()]
+    try:
+        return from_url(url)
+    except (BaseError, ValueError) as error:
+        raise StoreError(f"{url}: {error}; use a folder or a URL such as s3://bucket/path") from error

@@ -1,0 +1,95 @@
+"""A box around a vehicle: which blocks, columns and voxels of the city fall inside it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from presight_core import frames
+from presight_core.errors import InputError
+from presight_core.grid import Lattice
+
+LEAST_UPRIGHT = 0.1  # cosine of the tilt; a vehicle on its side has no ground plane to look up columns on
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Window:
+    """The prior inside a box of the ego frame. Rows are voxels, ordered by tile, block and packed voxel."""
+
+    points_ego: NDArray[np.float32]  # (N, 3) metres
+    points_world: NDArray[np.float64]  # (N, 3) metres
+    features: NDArray[np.uint8]  # (N, C) 255 = 1.0
+    hits: NDArray[np.uint32]  # (N,) surface points averaged
+    density: NDArray[np.float16]  # (N,) per metre
+    rgb: NDArray[np.uint8]  # (N, 3)
+    observed: NDArray[np.bool_]  # (X, Y) lattice columns that some ray saw; unknown is not empty
+    observed_origin: tuple[int, int]  # lattice column of observed[0, 0]
+    coverage: float  # share of the box's ground that is observed, 0..1
+    tiles: tuple[str, ...]  # that hold blocks in the box
+
+    def __len__(self) -> int:
+        return len(self.hits)
+
+
+@dataclass(frozen=True)
+class WindowBox:
+    """The half-open box `x_m` x `y_m` x `z_m` of the ego frame, placed in the world."""
+
+    world_from_ego: NDArray[np.float64]
+    x_m: Range
+    y_m: Range
+    z_m: Range
+
+    @staticmethod
+    def at(world_from_ego: ArrayLike, x_m: Range, y_m: Range, z_m: Range) -> "WindowBox":
+        """A checked box. Raises InputError for a pose that is not rigid, lies on its side, or an empty range."""
+        pose = np.asarray(world_from_ego, np.float64)
+        if pose.shape != (4, 4) or not frames.is_rigid(pose):
+            raise InputError(f"world_from_ego is not a rigid 4 x 4 transform: {pose.tolist()}; pass a pose in metres")
+        if pose[2, 2] < LEAST_UPRIGHT:
+            raise InputError(f"world_from_ego is tilted, cosine {pose[2, 2]:.2f}; the ego z axis must point up")
+        for name, (low, high) in {"x_m": x_m, "y_m": y_m, "z_m": z_m}.items():
+            if not low < high:
+                raise InputError(f"{name} = ({low}, {high}) is empty; give the lower end first")
+        return WindowBox(pose, x_m, y_m, z_m)
+
+    @property
+    def corners_world(self) -> NDArray[np.float64]:
+        """The eight corners (8, 3), world metres."""
+        corners_ego = np.stack(np.meshgrid(self.x_m, self.y_m, self.z_m), -1).reshape(8, 3)
+        return frames.apply(self.world_from_ego, corners_ego)
+
+    def block_range(self, lattice: Lattice) -> NDArray[np.int64]:
+        """Least and greatest blocks (2, 2) of the rectangle around the box's shadow."""
+        corners = self.corners_world
+        return lattice.block_of(lattice.voxel_of(np.stack([corners.min(0), corners.max(0)]))).astype(np.int64)
+
+    def meets(self, blocks: NDArray[np.int32], lattice: Lattice) -> NDArray[np.bool_]:
+        """Which blocks (N, 2) may hold voxels of the box; exact for a level vehicle.
+
+        Two rectangles are apart if an edge direction of either separates them: the lattice's and the heading's.
+        """
+        least, greatest = self.block_range(lattice)
+        near = np.all((blocks >= least) & (blocks <= greatest), -1)
+        forward = self.world_from_ego[:2, 0] / np.linalg.norm(self.world_from_ego[:2, 0])
+        axes = np.stack([forward, [-forward[1], forward[0]]], -1)
+        reach = lattice.block_m / 2 * np.abs(axes).sum(0)  # of a block, along each axis
+        corners = self.corners_world[:, :2] @ axes
+        centres = lattice.block_centre(blocks) @ axes
+        return near & np.all((centres + reach >= corners.min(0)) & (centres - reach <= corners.max(0)), -1)
+
+    def inside(self, points_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """World points (N, 3) in the ego frame, and which of them lie in the box."""
+        points_ego = frames.apply(frames.invert(self.world_from_ego), points_world)
+        low, high = np.transpose([self.x_m, self.y_m, self.z_m])
+        return points_ego, np.all((points_ego >= low) & (points_ego < high), -1)
+
+    def ground(self, columns: NDArray[np.int64], lattice: Lattice) -> NDArray[np.bool_]:
+        """Which columns (N, 2) of the lattice meet the ego ground plane (z = 0), at their centres, in x_m and y_m."""
+        offsets = (columns + 0.5) * lattice.voxel_m + lattice.origin_m[:2] - self.world_from_ego[:2, 3]
+        up = self.world_from_ego[:3, 2]
+        offsets = np.column_stack([offsets, -(offsets @ up[:2]) / up[2]])
+        x, y = (offsets @ self.world_from_ego[:3, :2]).T
+        return (x >= self.x_m[0]) & (x < self.x_m[1]) & (y >= self.y_m[0]) & (y < self.y_m[1])

@@ -1,0 +1,207 @@
+"""The prior store: cities, immutable builds of tiles, and the generations that publish them."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from obstore.store import ObjectStore
+
+from presight_core.errors import ConflictError, InputError, NotFoundError, StoreError
+from presight_core.grid import Lattice
+from presight_core.priors.documents import (
+    CityDocument,
+    Generation,
+    GenerationTile,
+    TileEntry,
+    checked_name,
+    city_path,
+    encode,
+    generation_path,
+)
+from presight_core.priors.location import ReadLocation
+from presight_core.priors.reader import PriorReader, generation_numbers, read_city, read_generation
+from presight_core.priors.schema import VoxelBatch
+from presight_core.priors.summary import TileSummary
+from storage.location import exists, open_store, put_once, size_bytes
+from storage.tile_groups import TileName, write_group
+
+MOST_ATTEMPTS = 100  # each lost race means that somebody else published; so many in one call is a fault
+
+
+@dataclass(frozen=True)
+class PriorStore:
+    """The writing side of a store. Nothing that was published is ever changed; any number of writers may race."""
+
+    location: str | Path
+    _objects: ObjectStore
+    _source: ReadLocation
+
+    @staticmethod
+    def open(location: str | Path) -> "PriorStore":
+        """The store in a folder (made if absent) or at a URL. Raises StoreError if it cannot be had."""
+        return PriorStore(location, open_store(location), ReadLocation(location))
+
+    def create_city(self, city: str, lattice: Lattice, space_id: str, channel_count: int) -> CityDocument:
+        """The city's fixed facts, stored now or before. Raises ConflictError if they were stored differently."""
+        wanted = CityDocument(city, lattice, space_id, channel_count)
+        if not put_once(self._objects, city_path(city), encode(wanted.to_json())):
+            present = self.city(city)
+            if present != wanted:
+                raise ConflictError(
+                    f"{self.location}/{city} was made with {present}, not {wanted}; "
+                    "keep those settings and models, or build into another store"
+                )
+        return wanted
+
+    def city(self, city: str) -> CityDocument:
+        """The city's fixed facts. Raises NotFoundError if the store has no such city."""
+        return read_city(self._source, city)
+
+    def write_tile(
+        self,
+        city: str,
+        tile_id: str,
+        build: str,
+        batches: Iterable[VoxelBatch],
+        drives: Sequence[str],
+        attributes: Mapping[str, Any],
+    ) -> TileEntry:
+        """Write one build of a tile, under a name used once; see `write_group`. Only `publish` makes it seen."""
+        return write_group(self._objects, self.city(city), TileName(tile_id, build), batches, drives, attributes)
+
+    def publish(
+        self,
+        city: str,
+        tiles: Mapping[str, GenerationTile],
+        parent: int | None,
+        tiling: Mapping[str, Any] | None = None,
+    ) -> int:
+        """Publish builds as one new generation; its number.
+
+        `parent` is the generation that the builds were planned on (None: the city had none), and the new
+        one keeps its other tiles. If others published meanwhile, their tiles are kept too. `tiling`
+        (`Tiling.to_json`) is needed for the first generation; tiles that a new tiling has not, or has
+        elsewhere, are no longer shown.
+
+        Raises ConflictError if somebody else published one of the same tiles or another tiling meanwhile,
+        StoreError if a build is not whole, NotFoundError if `parent` is not there.
+        """
+        facts = self.city(city)
+        self._check_builds(facts, tiles)
+        for _ in range(MOST_ATTEMPTS):
+            head = self.generation(city)
+            self._check_meanwhile(city, tiles, parent, head, tiling)
+            generation = _next(facts, head, tiles, tiling)
+            content = encode(generation.to_json())
+            path = generation_path(city, generation.number)
+            # A put whose answer was lost may have landed: then what is there is our own document.
+            if put_once(self._objects, path, content) or self._source.read(path) == content:
+                return generation.number
+        raise ConflictError(f"{city}: {MOST_ATTEMPTS} other generations came first; run it again")
+
+    def generation(self, city: str, number: int | None = None) -> Generation | None:
+        """A generation; for None the newest, or None if nothing is published. Raises NotFoundError for others."""
+        if number is None and not generation_numbers(self._source, city):
+            return None
+        return read_generation(self._source, city, number)
+
+    def generations(self, city: str) -> list[int]:
+        """Numbers of the published generations, ascending."""
+        return generation_numbers(self._source, city)
+
+    def summary(self, city: str, tile: GenerationTile) -> TileSummary:
+        """The extent of a written build, published or not."""
+        facts = self.city(city)
+        tiles = {"tile": tile}
+        table = PriorReader(self.location, facts, Generation(0, None, city, facts.space_id, {}, tiles)).tile("tile")
+        return TileSummary(tile.entry.voxel_count, table.block_index, table.all_rows("observed"))
+
+    def size_bytes(self, city: str) -> int:
+        """Bytes of everything the store keeps of a city: all builds and generations."""
+        return size_bytes(self._objects, checked_name(city))
+
+    def save_document(self, city: str, kind: str, name: str, value: Mapping[str, Any]) -> None:
+        """Keep a JSON document as <city>/<kind>/<name>.json, such as a tiling.
+
+        Saving the same again does nothing. Raises ConflictError if the name stands for something else.
+        """
+        path, content = _document_path(city, kind, name), encode(value)
+        if not put_once(self._objects, path, content) and self._source.read(path) != content:
+            raise ConflictError(f"{self.location}/{path} is there with other content; use another name")
+
+    def document(self, city: str, kind: str, name: str) -> dict[str, Any]:
+        """A document that `save_document` kept. Raises NotFoundError if it is not there."""
+        path = _document_path(city, kind, name)
+        content = self._source.read(path)
+        if content is None:
+            raise NotFoundError(f"{self.location} has no {path}; save it first")
+        try:
+            return json.loads(content)
+        except ValueError as error:
+            raise StoreError(f"{self.location}/{path}: {error}; restore it from a copy of the store") from error
+
+    def _check_builds(self, facts: CityDocument, tiles: Mapping[str, GenerationTile]) -> None:
+        for tile_id, tile in tiles.items():
+            path = f"{facts.city}/{tile.entry.path}"
+            if tile.entry.space_id != facts.space_id:
+                raise ConflictError(
+                    f"{tile_id} is in feature space {tile.entry.space_id}, {facts.city} in {facts.space_id}; "
+                    "rebuild the tile with the city's models"
+                )
+            if not exists(self._objects, f"{path}/zarr.json"):
+                raise StoreError(f"{path} is not a finished build; write the tile again")
+
+    def _check_meanwhile(
+        self,
+        city: str,
+        tiles: Mapping[str, GenerationTile],
+        parent: int | None,
+        head: Generation | None,
+        tiling: Mapping[str, Any] | None,
+    ) -> None:
+        """Raise ConflictError if what was published after `parent` touches what we publish."""
+        if head is None or head.number == parent:
+            return
+        base = read_generation(self._source, city, parent) if parent is not None else None
+        before = base.tiles if base else {}
+        changed = {tile_id for tile_id in head.tiles.keys() | before if head.tiles.get(tile_id) != before.get(tile_id)}
+        clash = sorted(changed & tiles.keys())
+        if clash:
+            raise ConflictError(
+                f"{city}: generation {head.number} changed {', '.join(clash)} after generation {parent}; "
+                "plan and build again"
+            )
+        if base and tiling and base.tiling != head.tiling != tiling:
+            raise ConflictError(f"{city}: generation {head.number} brought another tiling; plan and build again")
+
+
+def _next(
+    facts: CityDocument,
+    head: Generation | None,
+    tiles: Mapping[str, GenerationTile],
+    tiling: Mapping[str, Any] | None,
+) -> Generation:
+    """The generation after `head`: its tiles where the tiling still has them, and the new ones."""
+    chosen = dict(tiling) if tiling else head.tiling if head else None
+    if chosen is None:
+        raise InputError(f"{facts.city}: the first generation needs the city's tiling; pass tiling=")
+    places = _places(chosen)
+    unknown = sorted(tiles.keys() - places.keys())
+    if unknown:
+        raise InputError(f"{facts.city}: {', '.join(unknown)} not in tiling {chosen['tiling_id']}; plan again")
+    kept: dict[str, GenerationTile] = {}
+    if head is not None:
+        old = _places(head.tiling)
+        kept = {tile_id: tile for tile_id, tile in head.tiles.items() if places.get(tile_id) == old[tile_id]}
+    number, parent = (head.number + 1, head.number) if head else (1, None)
+    return Generation(number, parent, facts.city, facts.space_id, chosen, {**kept, **tiles})
+
+
+def _places(tiling: Mapping[str, Any]) -> dict[str, Any]:
+    return {tile["tile_id"]: tile["centroid_m"] for tile in tiling["tiles"]}
+
+
+def _document_path(city: str, kind: str, name: str) -> str:
+    return f"{checked_name(city)}/{checked_name(kind)}/{checked_name(name)}.json"
