@@ -16,6 +16,14 @@ class FramePixels:
     features: NDArray[np.uint8]  # (rows, columns, C) in the shared feature space, 255 = 1.0
 
 
+@dataclass(frozen=True)
+class FrameLayers:
+    """What the feature stage adds to one frame: the label map and the features, as in FramePixels."""
+
+    labels: NDArray[np.uint8]  # (h, w)
+    features: NDArray[np.uint8]  # (rows, columns, C)
+
+
 class PixelSource(Protocol):
     """Gives the pixels of the rows of one FrameTable; safe to call from several threads."""
 

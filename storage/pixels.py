@@ -1,0 +1,47 @@
+"""Pixels, label maps and features of frames, from the data sets' images and the feature cache."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from presight_core.drives import FrameTable
+from presight_core.errors import NotFoundError
+from presight_core.images import read_rgb, resized
+from presight_core.pixels import FramePixels, PixelSource
+from storage.features import FeatureCache
+
+
+class CachedPixels(PixelSource):
+    """Loads the rows of one FrameTable; safe to call from several threads."""
+
+    def __init__(
+        self, frames: FrameTable, roots: Mapping[str, str | Path], cache: FeatureCache, key: str, image_scale: float
+    ):
+        """`roots` gives the data set's folder of each drive; images are shrunk to `image_scale` of their size.
+
+        Raises NotFoundError if a frame is not in the feature cache under `key`.
+        """
+        self._frames, self._cache, self._key, self._scale = frames, cache, key, image_scale
+        self._roots = {drive_id: Path(root) for drive_id, root in roots.items()}
+        self._cache_rows = _cache_rows(frames, cache, key)
+
+    def load(self, row: int) -> FramePixels:
+        """Decode one row. Raises InputError if the image cannot be read or was rejected by the feature stage."""
+        frames, drive_id = self._frames, str(self._frames.drive_id[row])
+        layers = self._cache.read(self._key, drive_id, int(self._cache_rows[row]))
+        width, height = int(frames.width_px[row]), int(frames.height_px[row])
+        rgb = read_rgb(self._roots[drive_id] / str(frames.path[row]), width, height)
+        rgb = resized(rgb, max(1, round(width * self._scale)), max(1, round(height * self._scale)))
+        return FramePixels(rgb, layers.labels, layers.features)
+
+
+def _cache_rows(frames: FrameTable, cache: FeatureCache, key: str) -> np.ndarray:
+    """The feature cache's row of every frame (N,): a tile's frames are a choice of their drives' frames."""
+    rows = np.zeros(len(frames), np.int64)
+    known = {str(drive_id): cache.rows_of(key, str(drive_id)) for drive_id in np.unique(frames.drive_id)}
+    for row, (drive_id, path) in enumerate(zip(frames.drive_id.tolist(), frames.path.tolist(), strict=True)):
+        if path not in known[drive_id]:
+            raise NotFoundError(f"{path}: not in the features of drive {drive_id}; run the feature stage again")
+        rows[row] = known[drive_id][path]
+    return rows
