@@ -62,14 +62,13 @@ class PriorStore:
     def write_tile(
         self,
         city: str,
-        tile_id: str,
-        build: str,
+        name: TileName,
         batches: Iterable[VoxelBatch],
         drives: Sequence[str],
         attributes: Mapping[str, Any],
     ) -> TileEntry:
         """Write one build of a tile, under a name used once; see `write_group`. Only `publish` makes it seen."""
-        return write_group(self._objects, self.city(city), TileName(tile_id, build), batches, drives, attributes)
+        return write_group(self._objects, self.city(city), name, batches, drives, attributes)
 
     def publish(
         self,

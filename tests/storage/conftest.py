@@ -9,6 +9,7 @@ from presight_core.priors import PriorReader
 from presight_core.priors.documents import GenerationTile
 from presight_core.priors.example import ExampleTile
 from storage.priors import PriorStore
+from storage.tile_groups import TileName
 
 TILING = {
     "tiling_id": "tiling-1",
@@ -29,7 +30,8 @@ class Town:
     def write(self, tile_id: str, build: str, example: ExampleTile | None = None) -> GenerationTile:
         example = example or self.example
         drives = [f"drive-{number}" for number in range(example.drive_count)]
-        entry = self.store.write_tile("town", tile_id, build, example.batches(), drives, {"recipe": {"stage": "test"}})
+        attributes = {"recipe": {"stage": "test"}}
+        entry = self.store.write_tile("town", TileName(tile_id, build), example.batches(), drives, attributes)
         return GenerationTile(entry, {"stage": "test", "build": build})
 
     def reader(self, generation: int | None = None) -> PriorReader:

@@ -14,6 +14,7 @@ from presight_core.priors.documents import GenerationTile
 from presight_core.priors.schema import array_specs
 from storage import tile_groups
 from storage.priors import PriorStore
+from storage.tile_groups import TileName
 
 
 def test_what_was_written_reads_back(town):
@@ -87,7 +88,7 @@ def test_nothing_but_arrays_and_documents_lies_in_the_store(town):
 
 
 def test_an_empty_tile_can_be_written_and_read(empty_town):
-    entry = empty_town.store.write_tile("town", "t000", "build-1", [], ["drive-0"], {})
+    entry = empty_town.store.write_tile("town", TileName("t000", "build-1"), [], ["drive-0"], {})
     assert entry.voxel_count == entry.block_count == 0
     empty_town.store.publish("town", {"t000": GenerationTile(entry, {})}, None, empty_town.tiling)
     assert len(empty_town.reader().window(np.eye(4))) == 0
@@ -96,7 +97,7 @@ def test_an_empty_tile_can_be_written_and_read(empty_town):
 def test_batches_out_of_order_are_refused(empty_town):
     batches = list(empty_town.example.batches())
     with pytest.raises(AssertionError, match="batches ascend"):
-        empty_town.store.write_tile("town", "t000", "build-1", batches[::-1], ["a", "b", "c"], {})
+        empty_town.store.write_tile("town", TileName("t000", "build-1"), batches[::-1], ["a", "b", "c"], {})
 
 
 def test_a_build_is_written_once(empty_town):
@@ -111,7 +112,7 @@ def test_an_unfinished_build_is_cleared_and_written_again(empty_town):
         raise RuntimeError("power cut")
 
     with pytest.raises(RuntimeError):
-        empty_town.store.write_tile("town", "t000", "build-1", breaks_off(), ["a", "b", "c"], {})
+        empty_town.store.write_tile("town", TileName("t000", "build-1"), breaks_off(), ["a", "b", "c"], {})
     stray = empty_town.location / "town/tiles/t000/build-1/hits/c/99"
     stray.parent.mkdir(parents=True, exist_ok=True)
     stray.write_bytes(b"left over")
