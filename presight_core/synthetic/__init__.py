@@ -1,0 +1,1 @@
+"""A procedural city, pictures of it with exact ground truth, and drives through it in the nuScenes format."""

@@ -1,0 +1,107 @@
+"""Street furniture: lamps, signs, traffic lights, and the trees that line a street."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from presight_core.synthetic.blocks import Site
+from presight_core.synthetic.graph import Edge, Line, StreetGraph
+from presight_core.synthetic.ground import height_m
+from presight_core.synthetic.materials import Material
+from presight_core.synthetic.mesh import BOX_FACES, Box, Surface, cylinder
+
+STEEL = (0.30, 0.31, 0.32)
+SIGN_COLOURS = ((0.62, 0.06, 0.06), (0.05, 0.15, 0.55), (0.80, 0.62, 0.08), (0.05, 0.33, 0.14), (0.75, 0.75, 0.75))
+
+
+def furnish_streets(site: Site, graph: StreetGraph) -> None:
+    """Append the furniture of every street; street trees are only noted in `site.trees`."""
+    for edge in graph.edges:
+        _furnish(site, graph, edge)
+
+
+def _furnish(site: Site, graph: StreetGraph, edge: Edge) -> None:
+    rng, (a, b) = site.rng, edge
+    line, curb_m = graph.line(a, b), graph.half_width_m(a, b)
+    first, last = graph.mouth_m(a) + 6, line.length_m - graph.mouth_m(b) - 6  # 6: keep crossings clear
+    is_leafy = rng.random() < site.style.leafy_share
+    for side in (-1, 1):
+        for along_m in np.arange(first + rng.uniform(0, 8), last, 12.0):
+            if is_leafy and rng.random() < 0.85:
+                site.trees.append(line.at(along_m, side * (curb_m + 1.0)))
+        for along_m in np.arange(first + (5 if side > 0 else 18), last, 28.0):  # lamps stand staggered
+            _add_lamp(site, line.at(along_m, side * (curb_m + 0.5)), -side * line.left)
+        for along_m in rng.uniform(first, max(last, first + 1), 3):
+            _add_sign(site, line.at(along_m, side * (curb_m + 0.45)), -side * graph.drive_side * line.tangent)
+    _add_signals(site, graph, line, edge)
+
+
+def _add_signals(site: Site, graph: StreetGraph, line: Line, edge: Edge) -> None:
+    """Traffic lights at the stop lines, on the drivers' side of the street."""
+    curb_m = graph.half_width_m(*edge)
+    for node, along_m, into in (
+        (edge[0], graph.mouth_m(edge[0]), 1),
+        (edge[1], line.length_m - graph.mouth_m(edge[1]), -1),
+    ):
+        if graph.is_junction(node):
+            inward = graph.drive_side * into * line.left  # from the incoming drivers' curb over their lane
+            foot = line.at(along_m + 3.9 * into, 0) - inward * (curb_m + 0.5)  # 3.9: beside the stop line
+            _add_traffic_light(site, foot, into * line.tangent, inward)
+
+
+def _add_post(site: Site, foot: NDArray[np.float64], size_m: tuple[float, float], surface: Surface) -> float:
+    """An upright post of (radius, height); returns the ground's height at its foot."""
+    vertices, faces = cylinder(6)
+    radius_m, height = size_m
+    ground_m = float(height_m(*foot))
+    site.builder.add(vertices * [radius_m, radius_m, height] + [*foot, ground_m], faces, surface)
+    return ground_m
+
+
+def _add_box(site: Site, centre: ArrayLike, foot_m: float, size: tuple, yaw_rad: float, surface: Surface) -> None:
+    """A box of (length along yaw, width, height)."""
+    x, y = np.asarray(centre)
+    site.builder.add(Box(x, y, foot_m, size[0], size[1], size[2], yaw_rad).vertices(), BOX_FACES, surface)
+
+
+def _yaw(direction: NDArray[np.float64]) -> float:
+    return float(np.arctan2(direction[1], direction[0]))
+
+
+def _add_lamp(site: Site, foot: NDArray[np.float64], inward: NDArray[np.float64]) -> None:
+    steel = Surface(Material.POLE, STEEL, site.next_instance())
+    ground_m = _add_post(site, foot, (0.09, 7.5), steel)
+    yaw_rad = _yaw(inward)
+    _add_box(site, foot + inward * 1.2, ground_m + 7.4, (2.5, 0.12, 0.1), yaw_rad, steel)
+    head = foot + inward * 2.3
+    glass = Surface(Material.LAMP, (0.75, 0.75, 0.70), steel.instance)
+    _add_box(site, head, ground_m + 7.26, (0.8, 0.34, 0.14), yaw_rad, glass)
+    site.lamps.append(np.array([*head, ground_m + 7.2]))
+
+
+def _add_sign(site: Site, foot: NDArray[np.float64], facing: NDArray[np.float64]) -> None:
+    rng, instance = site.rng, site.next_instance()
+    ground_m = _add_post(site, foot, (0.045, 2.8), Surface(Material.POLE, (0.45, 0.45, 0.46), instance))
+    colour = SIGN_COLOURS[int(rng.integers(len(SIGN_COLOURS)))]
+    width, height = ((0.7, 0.7), (0.6, 0.9), (1.1, 0.6))[int(rng.integers(3))]
+    plate = Surface(Material.SIGN, colour, instance)
+    _add_box(site, foot + facing * 0.07, ground_m + 2.0, (0.04, width, height), _yaw(facing), plate)
+
+
+def _add_traffic_light(
+    site: Site, foot: NDArray[np.float64], facing: NDArray[np.float64], inward: NDArray[np.float64]
+) -> None:
+    """A mast with an arm over the lane; one head on the mast, one on the arm."""
+    instance = site.next_instance()
+    mast = Surface(Material.POLE, (0.16, 0.17, 0.16), instance)
+    ground_m = _add_post(site, foot, (0.1, 5.7), mast)
+    _add_box(site, foot + inward * 1.7, ground_m + 5.55, (3.4, 0.1, 0.1), _yaw(inward), mast)
+    is_green = site.rng.random() < 0.5
+    for place, foot_m in ((foot + inward * 3.2, ground_m + 4.75), (foot + facing * 0.2, ground_m + 2.5)):
+        housing = Surface(Material.TRAFFIC_LIGHT, (0.05, 0.05, 0.05), instance)
+        _add_box(site, place, foot_m, (0.3, 0.4, 1.1), _yaw(facing), housing)
+        lights = ((0.10, 0.80, 0.35) if is_green else (0.02, 0.10, 0.05), (0.16, 0.12, 0.02))
+        lights += ((0.14, 0.02, 0.02) if is_green else (0.95, 0.08, 0.05),)
+        for number, colour in enumerate(lights):
+            lens = Surface(Material.TRAFFIC_LIGHT, colour, instance)
+            height = foot_m + 0.08 + 0.33 * number
+            _add_box(site, place + facing * 0.15, height, (0.06, 0.27, 0.27), _yaw(facing), lens)

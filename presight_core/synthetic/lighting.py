@@ -1,0 +1,88 @@
+"""Daylight: sun, sky and camera response of a drive, as plain numbers that the kernels read."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+KINDS = ("day", "overcast", "dusk")
+
+Colour = tuple[float, float, float]
+
+
+class Lighting(NamedTuple):
+    """One drive's light; radiances are relative, 1 is about a sunlit grey card divided by its reflectance."""
+
+    to_sun: Colour  # unit vector
+    sun: Colour
+    ambient: Colour  # from above, without occlusion
+    horizon: Colour  # sky radiance
+    zenith: Colour
+    glow: float  # of the sky around the sun
+    clouds: float  # cover in 0..1
+    haze_m: float  # distance at which haze takes 63 %
+    lamps: float  # brightness of lamps and lit windows
+    exposure: float
+    balance: Colour  # of the camera's channels
+    noise: float  # sensor noise at mid grey
+
+
+class _Recipe(NamedTuple):
+    """Ranges that a kind of light is drawn from; elevation in radians above the horizon."""
+
+    elevation: tuple[float, float]
+    sun: Colour
+    ambient: Colour
+    horizon: Colour
+    zenith: Colour
+    glow: float
+    clouds: tuple[float, float]
+    haze_m: float
+    lamps: float
+    exposure: float
+    noise: float
+
+
+_RECIPES = {
+    "day": _Recipe((0.6, 1.1), (2.3, 2.2, 2.0), (0.75, 0.85, 1.0), (0.75, 0.85, 0.95), (0.25, 0.45, 0.85),
+                   0.6, (0.2, 0.8), 900.0, 0.0, 0.62, 0.010),
+    "overcast": _Recipe((0.8, 1.1), (0.30, 0.30, 0.30), (1.25, 1.3, 1.35), (0.95, 0.97, 1.0), (0.75, 0.80, 0.86),
+                        0.1, (0.5, 0.9), 450.0, 0.0, 0.62, 0.012),
+    "dusk": _Recipe((0.12, 0.25), (1.9, 1.05, 0.55), (0.45, 0.45, 0.58), (1.0, 0.62, 0.38), (0.22, 0.30, 0.55),
+                    1.2, (0.4, 0.9), 700.0, 0.8, 0.85, 0.018),
+}  # fmt: skip
+
+
+def sample_lighting(kind: str, rng: np.random.Generator) -> Lighting:
+    """One drive's light of a kind in KINDS: sun, clouds, exposure and white balance vary."""
+    recipe = _RECIPES[kind]
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(*recipe.elevation)
+    balance = np.exp(rng.normal(0, 0.05, 3))  # 5 %: automatic white balance is seldom better
+    return Lighting(
+        to_sun=_colour([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]),
+        sun=recipe.sun,
+        ambient=recipe.ambient,
+        horizon=recipe.horizon,
+        zenith=recipe.zenith,
+        glow=recipe.glow,
+        clouds=float(rng.uniform(*recipe.clouds)),
+        haze_m=recipe.haze_m,
+        lamps=recipe.lamps,
+        exposure=float(recipe.exposure * np.exp(rng.normal(0, 0.10))),  # 10 %: automatic exposure
+        balance=_colour(balance / balance.mean()),
+        noise=recipe.noise,
+    )
+
+
+def light_axes(to_light: Colour) -> NDArray[np.float64]:
+    """Rows u, v, light (3, 3): an orthonormal frame whose last axis points to the light."""
+    light = np.asarray(to_light, np.float64)
+    helper = np.array([0.0, 0.0, 1.0]) if abs(light[2]) < 0.99 else np.array([1.0, 0.0, 0.0])
+    u = np.cross(helper, light)
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(light, u), light])
+
+
+def _colour(values: object) -> Colour:
+    red, green, blue = np.asarray(values, np.float64).tolist()
+    return red, green, blue

@@ -1,0 +1,109 @@
+"""Pictures of a city with exact depth, labels and instances. CPU only, no randomness but the seeds given."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from presight_core.cameras import Camera
+from presight_core.classes import SKY
+from presight_core.frames import invert
+from presight_core.synthetic.actors import Actor, actor_mesh
+from presight_core.synthetic.city import City
+from presight_core.synthetic.lighting import Lighting
+from presight_core.synthetic.mesh import Mesh
+from presight_core.synthetic.raster import PinholeView, draw_perspective
+from presight_core.synthetic.shade import Scene, shade_view
+from presight_core.synthetic.shadow import ZENITH, Shadows, cast_shadows, shadow_map
+
+NEAR_M = 0.15
+FAR_M = 1500.0
+ACTOR_SHADOW_M = 60.0  # radius around the cameras within which actors throw shadows
+
+
+@dataclass(frozen=True)
+class Views:
+    """K images of one size; ground truth is sampled at pixel centres, where `Camera.rays` looks."""
+
+    rgb: NDArray[np.uint8]  # (K, H, W, 3)
+    depth_m: NDArray[np.float32]  # (K, H, W) along the optical axis; 0 where the sky is
+    labels: NDArray[np.uint8]  # (K, H, W) Cityscapes train ids
+    instances: NDArray[np.int32]  # (K, H, W) 0: none; FIRST_ACTOR or more: actors
+
+
+class Renderer:
+    """Renders one city. Calls are independent of each other and release the interpreter: use threads freely.
+
+    city = City(seed=3)
+    view = random_view(city, np.random.default_rng(0), width_px=400)  # street pose, rig, light, traffic
+    views = Renderer(city).render(view.cameras, view.lighting, view.actors)
+    """
+
+    def __init__(self, city: City):
+        self.city = city
+
+    def cast_shadows(self, lighting: Lighting, centre: ArrayLike, radius_m: float = 130.0) -> Shadows:
+        """Shadows of the city around a place (2,) or (3,), to be shared by many renders under the same light."""
+        x, y = np.asarray(centre, np.float64)[:2]
+        return cast_shadows(self.city.mesh, lighting, (x, y, 0.0), radius_m)
+
+    def render(
+        self,
+        cameras: Sequence[Camera],
+        lighting: Lighting,
+        actors: Sequence[Actor] = (),
+        shadows: Shadows | None = None,
+        seed: int = 0,
+    ) -> Views:
+        """Images of all cameras, which must share one size; `seed` decides the sensor noise."""
+        centre = np.mean([camera.world_from_camera[:3, 3] for camera in cameras], axis=0)
+        moving = actor_mesh(actors)
+        scene = Scene(
+            self.city.mesh,
+            moving,
+            lighting,
+            shadows or self.cast_shadows(lighting, centre),
+            shadow_map(moving, lighting.to_sun, centre, ACTOR_SHADOW_M, 0.12),
+            shadow_map(moving, ZENITH, centre, ACTOR_SHADOW_M, 0.25),
+        )
+        shots = [self._shoot(scene, camera, seed + 1000 * k) for k, camera in enumerate(cameras)]
+        rgb, depth_m, labels, instances = (np.stack(column) for column in zip(*shots, strict=True))
+        return Views(rgb, depth_m, labels, instances)
+
+    def _shoot(self, scene: Scene, camera: Camera, seed: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        shape = 2 * camera.height_px + 1, 2 * camera.width_px + 1  # samples half a pixel apart, edges included
+        nearness, faces = np.zeros(shape, np.float32), np.full(shape, -1, np.int32)
+        view = pinhole_view(camera)
+        draw_perspective(scene.city, view, 0, nearness, faces)
+        if len(scene.actors.faces):
+            draw_perspective(scene.actors, view, len(scene.city.faces), nearness, faces)
+        rgb = np.empty((camera.height_px, camera.width_px, 3), np.uint8)
+        shade_view(scene, view, nearness, faces, seed, rgb)
+        return rgb, *ground_truth(scene.city, scene.actors, nearness[1::2, 1::2], faces[1::2, 1::2])
+
+
+def pinhole_view(camera: Camera) -> PinholeView:
+    """The camera in sample coordinates: sample k lies at image coordinate k / 2, pixel centres at odd k."""
+    k = np.asarray(camera.intrinsics, np.float64)
+    return PinholeView(
+        focal_x=float(2 * k[0, 0]),
+        focal_y=float(2 * k[1, 1]),
+        centre_x=float(2 * k[0, 2]),
+        centre_y=float(2 * k[1, 2]),
+        camera_from_world=np.ascontiguousarray(invert(camera.world_from_camera)[:3, :3]),
+        position=np.ascontiguousarray(camera.world_from_camera[:3, 3], np.float64),
+        near_m=NEAR_M,
+        far_m=FAR_M,
+    )
+
+
+def ground_truth(
+    city: Mesh, actors: Mesh, nearness: NDArray[np.float32], faces: NDArray[np.int32]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
+    """Depth, labels and instances of visibility buffers."""
+    labels = np.concatenate([city.labels, actors.labels, [np.uint8(SKY)]])
+    instances = np.concatenate([city.instances, actors.instances, [np.int32(0)]])
+    seen = faces >= 0
+    depth_m = np.where(seen, 1 / np.where(seen, nearness, 1), 0).astype(np.float32)
+    return depth_m, labels[faces], instances[faces]  # -1, the sky, takes the last entry

@@ -1,0 +1,50 @@
+"""How a city looks: what makes two cities differ in more than their street plan."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+Colour = tuple[float, float, float]
+
+# Wall colours, linear reflectance.
+BRICK: tuple[Colour, ...] = ((0.48, 0.25, 0.18), (0.36, 0.19, 0.14), (0.55, 0.38, 0.28), (0.40, 0.30, 0.24))
+RENDER: tuple[Colour, ...] = ((0.70, 0.64, 0.52), (0.62, 0.50, 0.36), (0.66, 0.62, 0.58), (0.52, 0.58, 0.60))
+CONCRETE: tuple[Colour, ...] = ((0.48, 0.48, 0.48), (0.56, 0.55, 0.52), (0.36, 0.39, 0.44), (0.60, 0.62, 0.66))
+
+
+@dataclass(frozen=True)
+class CityStyle:
+    """Settings of one city; lengths in metres, shares in 0..1."""
+
+    size_m: float = 340.0  # edge of the square map
+    spacing_m: float = 105.0  # between parallel streets
+    margin_m: float = 55.0  # from the outermost street to the map's edge
+    left_hand: bool = True
+    dense_share: float = 0.55  # blocks of flats and shops; the others are houses with gardens, or parks
+    park_share: float = 0.12
+    leafy_share: float = 0.65  # streets lined with trees
+    floors: tuple[int, int] = (3, 12)  # of dense buildings
+    brick_share: float = 0.4
+    walls: tuple[Colour, ...] = BRICK + RENDER + CONCRETE
+    asphalt: Colour = (0.20, 0.20, 0.21)
+    foliage: Colour = (0.13, 0.24, 0.07)
+
+    @staticmethod
+    def random(rng: np.random.Generator, size_m: float = 340.0) -> "CityStyle":
+        """Another city: its own density, greenery, colours and driving side."""
+        palettes = (BRICK + RENDER, RENDER + CONCRETE, BRICK + CONCRETE, BRICK + RENDER + CONCRETE)
+        low = int(rng.integers(2, 6))
+        grey = float(rng.uniform(0.14, 0.26))
+        return CityStyle(
+            size_m=size_m,
+            spacing_m=float(rng.uniform(85, 125)),
+            left_hand=bool(rng.random() < 0.5),
+            dense_share=float(rng.uniform(0.3, 0.75)),
+            park_share=float(rng.uniform(0.05, 0.2)),
+            leafy_share=float(rng.uniform(0.3, 0.9)),
+            floors=(low, low + int(rng.integers(3, 12))),
+            brick_share=float(rng.uniform(0.1, 0.7)),
+            walls=palettes[int(rng.integers(len(palettes)))],
+            asphalt=(grey, grey, grey * 1.04),
+            foliage=(float(rng.uniform(0.10, 0.20)), float(rng.uniform(0.20, 0.28)), float(rng.uniform(0.05, 0.09))),
+        )
