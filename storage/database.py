@@ -85,13 +85,16 @@ class SqliteDatabase:
         with self.reading() as query:
             if not query("SELECT 1 FROM sqlite_master WHERE name = :name", name=VERSION_TABLE):
                 return None
-            return query(f"SELECT version_num FROM {VERSION_TABLE}")[0]["version_num"]
+            return _revision(query)
 
     def engine(self) -> "Engine":
         """A SQLAlchemy engine whose transactions take the write lock; makes the file's folder."""
         from sqlalchemy import URL
 
-        self.file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unusable(str(self.file), error) from error
         with _sqlite_errors(self.file), _connected(self.file) as connection:
             connection.execute("PRAGMA journal_mode = WAL")  # kept in the file; readers never wait for writers
         return _engine(URL.create("sqlite", database=str(self.file)))
@@ -157,7 +160,7 @@ class SqlalchemyDatabase:
         with self._connected() as connection:
             if not sqlalchemy.inspect(connection).has_table(VERSION_TABLE):
                 return None
-            return _SqlalchemyQuery(connection)(f"SELECT version_num FROM {VERSION_TABLE}")[0]["version_num"]
+            return _revision(_SqlalchemyQuery(connection))
 
     def engine(self) -> "Engine":
         """The engine."""
@@ -190,6 +193,11 @@ class _SqlalchemyQuery:
 
         result = self.connection.execute(text(sql), values)
         return [dict(row) for row in result.mappings()] if result.returns_rows else []
+
+
+def _revision(query: Query) -> str | None:
+    rows = query(f"SELECT version_num FROM {VERSION_TABLE}")
+    return rows[0]["version_num"] if rows else None
 
 
 def _engine(url: Any) -> "Engine":
