@@ -73,6 +73,7 @@ class FieldSettings(Settings):
         GridSettings(levels=8, features_per_level=1, max_resolution=4096, log2_rows=20),
     )
     hidden_width: Count = 64
+    proposal_width: Count = 64  # hidden units of the proposal networks (paper: 64 everywhere)
     geometry_channels: Count = 15
     video_embedding: Count = 12
     image_embedding: Annotated[int, Field(ge=0)] = 4
@@ -87,6 +88,7 @@ class SamplingSettings(Settings):
     linear_m: Metres = 100.0
     proposal_samples: tuple[Count, ...] = (128, 64)
     field_samples: Count = 64
+    padding: Annotated[float, Field(ge=0)] = 0.01  # added to every proposal weight before sampling (released code)
 
 
 class LossSettings(Settings):

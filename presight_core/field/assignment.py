@@ -1,0 +1,59 @@
+"""Sorting points by the sub-field they belong to, and putting results back in order."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """A stable sort of points by sub-field. `order` is None where there is one sub-field only."""
+
+    segments: Tensor  # (sub-fields + 1,) int64: rows segments[s]..segments[s + 1] of the sorted points
+    bounds: list[int]  # the same, for Python
+    order: Tensor | None  # (N,) original row of each sorted row
+    places: Tensor | None  # (N,) sorted row of each original row
+
+    def sort(self, values: Tensor) -> Tensor:
+        """Rows (N, ...) of the original order, sorted by sub-field."""
+        return values if self.order is None else values[self.order]
+
+    def restore(self, values: Tensor) -> Tensor:
+        """Rows (N, ...) sorted by sub-field, in the original order."""
+        return values if self.order is None else _Permutation.apply(values, self.places, self.order)  # type: ignore[return-value]
+
+    def spread(self, values: Tensor) -> Tensor:
+        """A row for each sorted point, of one row (sub-fields, ...) for each sub-field."""
+        return values if self.order is None else values.repeat_interleave(self.segments.diff(), 0)
+
+
+def assign(points: Tensor, centroids: Tensor) -> Assignment:
+    """Points (N, 3) to the nearest of the centroids (sub-fields, 3) (paper, section 3.2)."""
+    count = len(centroids)
+    if count == 1:
+        bounds = [0, len(points)]
+        return Assignment(torch.tensor(bounds, device=points.device), bounds, None, None)
+    # |p - c|^2 less what all centroids share, halved.
+    distances = (centroids.square().sum(-1) / 2) - points.detach() @ centroids.T
+    sub_field = distances.argmin(-1)
+    order = torch.argsort(sub_field, stable=True)
+    places = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+    segments = torch.zeros(count + 1, dtype=torch.int64, device=points.device)
+    segments[1:] = torch.bincount(sub_field, minlength=count).cumsum(0)
+    return Assignment(segments, segments.tolist(), order, places)
+
+
+class _Permutation(torch.autograd.Function):
+    """Rows in a new order. The gradient is a gather too, where indexing's own would add row by row."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, rows: Tensor, inverse: Tensor) -> Tensor:
+        ctx.save_for_backward(inverse)
+        return values[rows]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        (inverse,) = ctx.saved_tensors
+        return gradients[0][inverse], None, None

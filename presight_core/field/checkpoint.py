@@ -1,0 +1,82 @@
+"""Fields and training states on disk: safetensors, each file replaced in one step.
+
+A safetensors header holds the JSON that describes the tensors, so one rename commits both. The `.json`
+beside a field is a copy for people.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+from torch import Tensor
+
+from presight_core.errors import InputError, NotFoundError
+from presight_core.field.tile_field import FieldShape, TileField
+
+FIELD_FILE = "field.safetensors"
+FIELD_VERSION = 1  # of the parameters' names and meaning
+
+
+def save_field(folder: Path, field: TileField) -> None:
+    """Write a field's parameters and shape into a folder, made if need be."""
+    header = {"version": FIELD_VERSION, "shape": field.shape.to_json()}
+    save_tensors(folder / FIELD_FILE, dict(field.state_dict()), header)
+    _replace(folder / "field.json", lambda file: file.write_text(json.dumps(header, indent=2), encoding="utf-8"))
+
+
+def load_field(folder: Path, device: str = "cpu") -> TileField:
+    """The field that `save_field` wrote.
+
+    Raises NotFoundError if there is none, InputError if it is damaged or of another version.
+    """
+    tensors, header = load_tensors(folder / FIELD_FILE, device)
+    if header.get("version") != FIELD_VERSION:
+        found = header.get("version")
+        raise InputError(f"{folder / FIELD_FILE}: version {found}, this program reads {FIELD_VERSION}; train it again")
+    field = TileField(FieldShape.from_json(header["shape"]))
+    field.load_state_dict(tensors)
+    return field.to(device).eval()
+
+
+def save_tensors(file: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
+    """Write tensors and a JSON header to one file: wholly, or not at all."""
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    metadata = {"header": json.dumps(header)}
+    _replace(file, lambda partial: safetensors.torch.save_file(contiguous, partial, metadata))
+
+
+def load_tensors(file: Path, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and header of a file that `save_tensors` wrote.
+
+    Raises NotFoundError if it is absent, InputError if it cannot be read.
+    """
+    if not file.exists():
+        raise NotFoundError(f"{file} does not exist; train the tile first")
+    try:
+        with safetensors.safe_open(file, framework="pt", device=device) as opened:
+            header = json.loads((opened.metadata() or {})["header"])
+            return {name: opened.get_tensor(name) for name in opened.keys()}, header  # noqa: SIM118 - not a dict
+    except (safetensors.SafetensorError, KeyError, ValueError) as error:
+        raise InputError(f"{file} is damaged ({error}); delete it and train the tile again") from error
+
+
+def _replace(file: Path, write: Any) -> None:
+    """Let `write` fill a file beside `file`, make it durable, and put it in place in one step."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_name(f"{file.name}.partial")
+    write(partial)
+    _flush(partial, os.O_RDWR)
+    partial.replace(file)
+    _flush(file.parent, os.O_RDONLY)
+
+
+def _flush(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,88 @@
+"""The multi-resolution hash encoding of Instant-NGP, as one torch operator for any number of sub-fields.
+
+The main grid and the proposals of all sub-fields use the same operator. Its kernels are chosen by device:
+numba on a CPU, plain torch elsewhere.
+"""
+
+from collections.abc import Callable
+
+import numba
+import torch
+from torch import Tensor
+
+from presight_core.field.hash_encode import numba_kernels, torch_reference
+from presight_core.field.hash_encode.layout import GridLayout, grid_layout
+
+__all__ = ["GridLayout", "grid_layout", "hash_encode"]
+
+
+@torch.library.custom_op("presight::hash_encode", mutates_args=(), device_types="cpu")
+def hash_encode(points: Tensor, segments: Tensor, table: Tensor, offsets: Tensor, levels: Tensor) -> Tensor:
+    """Encoded points (N, levels * features), level by level; differentiable in points and table.
+
+    `points` (N, 3) float32 in [0, 1), sorted by sub-field; rows segments[s]..segments[s + 1] belong to
+    sub-field s (`segments` is int64). `table` (rows, features) float32, `offsets` and `levels` come from a
+    GridLayout. No half-cell shift: corner 0 of every level lies on the origin.
+    """
+    output = table.new_empty(len(points), len(levels) * table.shape[1])
+    _run(numba_kernels.encode, points, segments, table, offsets, levels, output)
+    return output
+
+
+@torch.library.custom_op("presight::hash_encode_table_gradient", mutates_args=(), device_types="cpu")
+def table_gradient(points: Tensor, segments: Tensor, gradient: Tensor, offsets: Tensor, levels: Tensor) -> Tensor:
+    """Gradient (rows, features) of the table; `gradient` is that of the output."""
+    result = gradient.new_zeros(int(offsets[-1, -1] + levels[-1, 1]), gradient.shape[1] // len(levels))
+    _run(numba_kernels.table_gradient, points, segments, gradient, offsets, levels, result)
+    return result
+
+
+@torch.library.custom_op("presight::hash_encode_point_gradient", mutates_args=())
+def point_gradient(
+    points: Tensor, segments: Tensor, table: Tensor, offsets: Tensor, levels: Tensor, gradient: Tensor
+) -> Tensor:
+    """Gradient (N, 3) of the points; plain torch everywhere, for training asks for the table's only."""
+    return torch_reference.point_gradient(points, segments, table, offsets, levels, gradient)
+
+
+hash_encode.register_kernel("cuda")(torch_reference.encode)
+table_gradient.register_kernel("cuda")(torch_reference.table_gradient)
+
+
+@hash_encode.register_fake
+def _(points, segments, table, offsets, levels):
+    return table.new_empty(len(points), len(levels) * table.shape[1])
+
+
+@table_gradient.register_fake
+def _(points, segments, gradient, offsets, levels):
+    rows = torch.library.get_ctx().new_dynamic_size()
+    return gradient.new_empty(rows, gradient.shape[1] // len(levels))
+
+
+@point_gradient.register_fake
+def _(points, segments, table, offsets, levels, gradient):
+    return torch.empty_like(points)
+
+
+def _remember(ctx, inputs, output) -> None:
+    ctx.save_for_backward(*inputs)
+
+
+def _backward(ctx, gradient):
+    points, segments, table, offsets, levels = ctx.saved_tensors
+    gradient = gradient.contiguous()
+    of_points, of_table = None, None
+    if ctx.needs_input_grad[0]:
+        of_points = point_gradient(points, segments, table, offsets, levels, gradient)
+    if ctx.needs_input_grad[2]:
+        of_table = table_gradient(points, segments, gradient, offsets, levels)
+    return of_points, None, of_table, None, None
+
+
+hash_encode.register_autograd(_backward, setup_context=_remember)
+
+
+def _run(kernel: Callable[..., None], *tensors: Tensor) -> None:
+    """Run a kernel on the arrays of tensors, with as many workers as numba may use; the last tensor is filled."""
+    kernel(*(tensor.detach().contiguous().numpy() for tensor in tensors), numba.get_num_threads())

@@ -1,0 +1,72 @@
+"""Volume rendering: densities along rays become weights, and weights become colours and depths."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+class TruncatedExponential(torch.autograd.Function):
+    """exp(x) whose gradient stays finite: density may grow by many powers of e without blowing up a step."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.exp()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        return gradients[0] * x.clamp(-15, 15).exp()  # Instant-NGP's bounds
+
+
+def truncated_exponential(x: Tensor) -> Tensor:
+    """exp(x), with the gradient's exponent clamped to -15..15."""
+    return TruncatedExponential.apply(x)  # type: ignore[return-value]
+
+
+def ray_weights(
+    density: Float[Tensor, "rays samples"], lengths_m: Float[Tensor, "rays samples"]
+) -> Float[Tensor, "rays samples"]:
+    """Share of a ray that ends in each sample: T^i alpha^i of the paper; `density` is per metre."""
+    optical = density * lengths_m
+    before = optical.cumsum(-1) - optical
+    return (1 - torch.exp(-optical)) * torch.exp(-before)
+
+
+def expected_depth(
+    weights: Float[Tensor, "rays samples"], middles: Float[Tensor, "rays samples"]
+) -> Float[Tensor, " rays"]:
+    """Mean depth of where a ray ends; an empty ray gives its first middle."""
+    depth = (weights * middles).sum(-1) / (weights.sum(-1) + 1e-10)
+    return torch.minimum(torch.maximum(depth, middles[:, 0]), middles[:, -1])
+
+
+def first_hit(weights: Float[Tensor, "rays samples"], threshold: float = 0.5) -> tuple[Tensor, Bool[Tensor, " rays"]]:
+    """Index of the first sample at which the summed weight reaches `threshold`, and whether one does.
+
+    Where none does the index is the last.
+    """
+    reached = weights.cumsum(-1) >= threshold
+    found = reached[:, -1]
+    index = (~reached).sum(-1).clamp_max(weights.shape[-1] - 1)
+    return index, found
+
+
+def first_hit_depth(
+    weights: Float[Tensor, "rays samples"], edges_m: Float[Tensor, "rays edges"], threshold: float = 0.5
+) -> tuple[Float[Tensor, " rays"], Bool[Tensor, " rays"]]:
+    """Depth at which the summed weight passes `threshold`, taken to rise evenly inside a sample."""
+    index, found = first_hit(weights, threshold)
+    index = index[:, None]
+    weight = weights.gather(-1, index)
+    before = weights.cumsum(-1).gather(-1, index) - weight
+    share = ((threshold - before) / weight.clamp_min(1e-6)).clamp(0, 1)
+    start, end = edges_m.gather(-1, index), edges_m.gather(-1, index + 1)
+    return (start + share * (end - start))[:, 0], found
+
+
+def blend(weights: Float[Tensor, "rays samples"], values: Float[Tensor, "rays samples channels"]) -> Tensor:
+    """Weighted sums (rays, channels) along each ray."""
+    return torch.einsum("rs,rsc->rc", weights, values.to(weights))

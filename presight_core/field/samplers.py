@@ -1,0 +1,82 @@
+"""Where samples lie along a ray.
+
+Places along a ray have two scales: metres from the origin, and `s`, which runs from 0 at the near plane to
+1 at the far plane, linear in metres at first and in disparity beyond.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """The map between s and metres: half of the spacing lies before `linear_m`, half between it and infinity."""
+
+    near_m: float | Tensor
+    far_m: float | Tensor
+    linear_m: float
+
+    def metres(self, s: Tensor) -> Tensor:
+        """Metres along the ray at s."""
+        near, far = self._spaced(self.near_m, s), self._spaced(self.far_m, s)
+        return metres_from_spacing(s * far + (1 - s) * near, self.linear_m)
+
+    def _spaced(self, metres: float | Tensor, like: Tensor) -> Tensor:
+        return spacing_from_metres(torch.as_tensor(metres, dtype=like.dtype, device=like.device), self.linear_m)
+
+
+def spacing_from_metres(metres: Tensor, linear_m: float) -> Tensor:
+    """The spacing function: linear up to `linear_m` (where it is 1/2), then in disparity, 1 at infinity."""
+    return torch.where(metres < linear_m, metres / (2 * linear_m), 1 - linear_m / (2 * metres))
+
+
+def metres_from_spacing(spaced: Tensor, linear_m: float) -> Tensor:
+    """The inverse of `spacing_from_metres`."""
+    return torch.where(spaced < 0.5, 2 * linear_m * spaced, linear_m / (2 - 2 * spaced))
+
+
+def uniform_edges(
+    ray_count: int, sample_count: int, jitter: Float[Tensor, "rays 1"] | None, like: Tensor
+) -> Float[Tensor, "rays edges"]:
+    """Edges s of equal bins; with `jitter` (in [0, 1)) each edge moves by up to half a bin, all alike on a ray."""
+    edges = torch.linspace(0, 1, sample_count + 1, dtype=like.dtype, device=like.device)
+    if jitter is None:
+        return edges.expand(ray_count, -1)
+    middles = (edges[1:] + edges[:-1]) / 2
+    lower, upper = torch.cat([edges[:1], middles]), torch.cat([middles, edges[-1:]])
+    return lower + (upper - lower) * jitter
+
+
+def resample(
+    edges: Float[Tensor, "rays edges"],
+    weights: Float[Tensor, "rays bins"],
+    sample_count: int,
+    jitter: Float[Tensor, "rays 1"] | None,
+    padding: float,
+) -> Float[Tensor, "rays new_edges"]:
+    """Edges s of `sample_count` new bins, dense where the histogram is heavy.
+
+    Inverse-transform sampling at equally spaced quantiles; `padding` is added to every weight first, so
+    that no stretch of the ray goes without samples. Without `jitter` each quantile is the middle of its share.
+    """
+    padded = weights.detach() + padding
+    total = padded.sum(-1, keepdim=True)
+    lacking = torch.relu(1e-5 - total)  # an all-zero ray without padding becomes uniform
+    density = (padded + lacking / padded.shape[-1]) / (total + lacking)
+    reached = torch.cat([torch.zeros_like(density[:, :1]), density.cumsum(-1).clamp_max(1)], -1)
+    share = 1 / (sample_count + 1)
+    quantiles = torch.arange(sample_count + 1, dtype=weights.dtype, device=weights.device) * share
+    quantiles = quantiles + (share / 2 if jitter is None else jitter * share)
+    return _interpolate(quantiles.expand(len(edges), -1).contiguous(), reached, edges)
+
+
+def _interpolate(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
+    """Piecewise-linear `values` over ascending `known`, at the places `at`; all (rays, any)."""
+    above = torch.searchsorted(known, at, right=True).clamp(1, known.shape[-1] - 1)
+    low, high = known.gather(-1, above - 1), known.gather(-1, above)
+    share = ((at - low) / (high - low).clamp_min(1e-12)).clamp(0, 1)
+    first, last = values.gather(-1, above - 1), values.gather(-1, above)
+    return first + share * (last - first)

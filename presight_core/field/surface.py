@@ -1,0 +1,80 @@
+"""The surface a ray meets, and what the field says there (paper, section 3.3)."""
+
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from presight_core.field import rendering
+from presight_core.field.tile_field import Rays, Sampling, TileField
+
+CHUNK_RAYS = 8192  # activations of a chunk stay near 100 MB at 128 samples
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """One point for each ray. Where `found` is False the other values mean nothing."""
+
+    found: NDArray[np.bool_]  # (R,) most of the ray's weight lies before the sky
+    depth_m: NDArray[np.float32]  # (R,) along the ray
+    points_world: NDArray[np.float64]  # (R, 3) metres: origin + depth_m * direction
+    features: NDArray[np.float32]  # (R, C) in [0, 1]
+    rgb: NDArray[np.float32]  # (R, 3) in [0, 1], at the mean of all embeddings
+    density: NDArray[np.float32]  # (R,) per metre, mean of the field and its proposals
+
+
+def find_surface(
+    field: TileField,
+    origins_world: NDArray[np.float64],
+    directions_world: NDArray[np.float64],
+    surface: Literal["first-hit", "expected"],
+) -> SurfacePoints:
+    """Surface points of rays with world origins (R, 3), metres, and unit directions (R, 3).
+
+    first-hit: where the summed weight passes one half. expected: at the mean depth of the weight.
+    Features, colour and density are those of the field at that very point.
+    """
+    chunks = [
+        _surface_of_chunk(field, origins_world[first:last], directions_world[first:last], surface)
+        for first in range(0, max(len(origins_world), 1), CHUNK_RAYS)
+        for last in (first + CHUNK_RAYS,)
+    ]
+    columns = {
+        column.name: np.concatenate([getattr(chunk, column.name) for chunk in chunks])
+        for column in fields(SurfacePoints)
+    }
+    return SurfacePoints(**columns)
+
+
+@torch.no_grad()
+def _surface_of_chunk(
+    field: TileField, origins_world: NDArray, directions_world: NDArray, surface: str
+) -> SurfacePoints:
+    rays = field.rays(origins_world, directions_world)
+    depth, found = _depth(field, rays, surface)
+    points = (rays.origins + depth[:, None] * rays.directions)[:, None]
+    values = field.query(points, field.conditions(rays))
+    density = torch.stack([values.density, *field.proposal_densities(points)]).mean(0)
+    depth_m = depth.cpu().numpy()
+    return SurfacePoints(
+        found.cpu().numpy(),
+        depth_m,
+        np.asarray(origins_world, np.float64) + depth_m[:, None].astype(np.float64) * directions_world,
+        values.features[:, 0].clamp(0, 1).cpu().numpy(),
+        values.rgb[:, 0].cpu().numpy(),
+        density[:, 0].cpu().numpy(),
+    )
+
+
+def _depth(field: TileField, rays: Rays, surface: str) -> tuple[Tensor, Tensor]:
+    """Depth (R,) of the surface along each ray, and whether there is one."""
+    _, edges = field.place_samples(rays, Sampling())
+    edges_m = field.spacing.metres(edges)
+    weights = rendering.ray_weights(field.density(rays.points(edges_m)), edges_m.diff(dim=-1))
+    depth, found = rendering.first_hit_depth(weights, edges_m)
+    if surface == "expected":
+        depth = rendering.expected_depth(weights, (edges_m[:, 1:] + edges_m[:, :-1]) / 2)
+    return depth, found

@@ -1,0 +1,297 @@
+"""The scene representation of a tile (paper, section 3.2).
+
+Sub-fields, each a hash grid with its own small networks, share a sky, two proposal networks' sampling and
+the embeddings of videos and images. A sample belongs to the sub-field with the nearest centroid.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from presight_core.config import FieldSettings, GridSettings, SamplingSettings
+from presight_core.field import rendering, samplers
+from presight_core.field.assignment import Assignment, assign
+from presight_core.field.contraction import grid_position
+from presight_core.field.hash_grid import HashGrid
+from presight_core.field.mlp import SubFieldMlp
+from presight_core.field.spherical_harmonics import HARMONICS, spherical_harmonics
+from presight_core.tiles import SubField
+
+SKY_WIDTH = 32  # released code
+
+
+@dataclass(frozen=True)
+class FieldShape:
+    """Everything that decides which parameters a field has and how it samples."""
+
+    sub_fields: tuple[SubField, ...]
+    settings: FieldSettings
+    sampling: SamplingSettings
+    feature_channels: int
+    video_count: int
+    image_count: int
+
+    def to_json(self) -> dict[str, Any]:
+        """The shape as JSON values."""
+        return {
+            **asdict(self),
+            "sub_fields": [sub_field.to_json() for sub_field in self.sub_fields],
+            "settings": self.settings.model_dump(mode="json"),
+            "sampling": self.sampling.model_dump(mode="json"),
+        }
+
+    @staticmethod
+    def from_json(value: dict[str, Any]) -> "FieldShape":
+        """The shape that `to_json` wrote."""
+        sub_fields = tuple(
+            SubField(**{name: tuple(corner) for name, corner in sub_field.items()}) for sub_field in value["sub_fields"]
+        )
+        settings, sampling = FieldSettings(**value["settings"]), SamplingSettings(**value["sampling"])
+        counts = (int(value[name]) for name in ("feature_channels", "video_count", "image_count"))
+        return FieldShape(sub_fields, settings, sampling, *counts)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays in the field frame. Without videos or images the mean of all their embeddings is used."""
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]  # unit length
+    videos: Int[Tensor, " rays"] | None = None
+    images: Int[Tensor, " rays"] | None = None
+
+    def points(self, edges_m: Float[Tensor, "rays edges"]) -> Float[Tensor, "rays samples 3"]:
+        """The middle of each stretch between two edges."""
+        middles = (edges_m[:, 1:] + edges_m[:, :-1]) / 2
+        return self.origins[:, None] + middles[..., None] * self.directions[:, None]
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Where rays end: weights of the stretches between edges, which are in s (see samplers)."""
+
+    edges: Float[Tensor, "rays edges"]
+    weights: Float[Tensor, "rays bins"]
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How samples are placed in one pass. The default is that of evaluation: nothing random."""
+
+    generator: torch.Generator | None = None  # None: no jitter
+    anneal: float = 1.0  # exponent of the proposals' weights; below 1 they are flattened
+    train_proposals: bool = False
+
+
+@dataclass(frozen=True)
+class PointValues:
+    """What the field says about points of rays; density per metre, colours and features in 0..1."""
+
+    density: Float[Tensor, "rays samples"]
+    rgb: Float[Tensor, "rays samples 3"]
+    features: Float[Tensor, "rays samples channels"]
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What rays see."""
+
+    rgb: Float[Tensor, "rays 3"]
+    features: Float[Tensor, "rays channels"]
+    edges_m: Float[Tensor, "rays edges"]  # of the field's samples
+    field: Histogram
+    proposals: tuple[Histogram, ...]
+
+    @property
+    def accumulation(self) -> Float[Tensor, " rays"]:
+        """Share of each ray that ends before the sky."""
+        return self.field.weights.sum(-1)
+
+
+class DensityNetwork(nn.Module):
+    """A hash grid and a small network with one density (proposals) or a density and more (the trunk)."""
+
+    def __init__(self, grid: GridSettings, sub_field_count: int, width: int, outputs: int) -> None:
+        super().__init__()
+        self.grid = HashGrid(grid, sub_field_count)
+        self.network = SubFieldMlp(sub_field_count, (self.grid.output_width, width, outputs))
+
+    def forward(self, positions: Tensor, assignment: Assignment) -> Tensor:
+        """Outputs (N, outputs) at positions (N, 3) of the grids, sorted by sub-field."""
+        return self.network(self.grid(positions, assignment.segments), assignment.bounds)
+
+
+class TileField(nn.Module):
+    """Density, colour and features everywhere in a tile, and the sky around it."""
+
+    centroids: Tensor
+    box_centre: Tensor
+    box_half: Tensor
+
+    def __init__(self, shape: FieldShape) -> None:
+        super().__init__()
+        self.shape = shape
+        settings, count, channels = shape.settings, len(shape.sub_fields), shape.feature_channels
+        width, geometry = settings.hidden_width, settings.geometry_channels
+        self.origin_m = np.mean([sub_field.centroid_m for sub_field in shape.sub_fields], 0)  # world, float64
+        self._place_sub_fields()
+        self.trunk = DensityNetwork(settings.grid, count, width, 1 + geometry + width)
+        video, image = settings.video_embedding, settings.image_embedding
+        self.colour = SubFieldMlp(count, (geometry + HARMONICS + video + image, width, width, 3))
+        self.semantics = SubFieldMlp(count, (width, width, width, channels))
+        self.sky_colour = SubFieldMlp(count, (HARMONICS + video, SKY_WIDTH, SKY_WIDTH, 3))
+        self.sky_features = SubFieldMlp(count, (HARMONICS, SKY_WIDTH, SKY_WIDTH, channels))
+        self.video_embedding = nn.Embedding(shape.video_count, video)
+        self.image_embedding = nn.Embedding(shape.image_count, image)
+        self.proposals = nn.ModuleList(
+            DensityNetwork(grid, count, settings.proposal_width, 1) for grid in settings.proposals
+        )
+        self.spacing = samplers.Spacing(shape.sampling.near_m, shape.sampling.far_m, shape.sampling.linear_m)
+
+    def _place_sub_fields(self) -> None:
+        corners = {
+            name: np.array([getattr(sub_field, name) for sub_field in self.shape.sub_fields]) - self.origin_m
+            for name in ("centroid_m", "box_min_m", "box_max_m")
+        }
+        low, high = corners["box_min_m"], corners["box_max_m"]
+        for name, value in (
+            ("centroids", corners["centroid_m"]),
+            ("box_centre", (low + high) / 2),
+            ("box_half", (high - low) / 2),
+        ):
+            self.register_buffer(name, torch.from_numpy(value).float(), persistent=False)
+
+    def use_dtype(self, dtype: torch.dtype) -> None:
+        """Let the networks calculate in this type; parameters stay float32."""
+        for module in self.modules():
+            if isinstance(module, SubFieldMlp):
+                module.dtype = dtype
+
+    def rays(
+        self,
+        origins_world: NDArray[np.float64],
+        directions_world: NDArray[np.float64],
+        videos: NDArray[np.int64] | None = None,
+        images: NDArray[np.int64] | None = None,
+    ) -> Rays:
+        """Rays of world origins (R, 3), metres, and unit directions (R, 3), on the field's device.
+
+        The origin is subtracted in float64: float32 world coordinates would be wrong by centimetres.
+        """
+        device = self.centroids.device
+        vectors = (
+            torch.from_numpy(np.asarray(value, np.float32)).to(device)
+            for value in (np.asarray(origins_world, np.float64) - self.origin_m, directions_world)
+        )
+        numbers = (
+            None if value is None else torch.from_numpy(np.asarray(value, np.int64)).to(device)
+            for value in (videos, images)
+        )
+        return Rays(*vectors, *numbers)
+
+    def forward(self, rays: Rays, sampling: Sampling = Sampling()) -> Rendering:
+        """Render rays: sample, query, blend, and add the sky behind."""
+        conditions = self.conditions(rays)
+        proposals, edges = self.place_samples(rays, sampling)
+        edges_m = self.spacing.metres(edges)
+        values = self.query(rays.points(edges_m), conditions)
+        weights = rendering.ray_weights(values.density, edges_m.diff(dim=-1))
+        behind = 1 - weights.sum(-1, keepdim=True)
+        sky_rgb, sky_features = self._sky(rays, conditions)
+        return Rendering(
+            rendering.blend(weights, values.rgb) + behind * sky_rgb,
+            rendering.blend(weights, values.features) + behind * sky_features,
+            edges_m,
+            Histogram(edges, weights),
+            proposals,
+        )
+
+    def place_samples(
+        self, rays: Rays, sampling: Sampling
+    ) -> tuple[tuple[Histogram, ...], Float[Tensor, "rays edges"]]:
+        """Histograms of the proposals, and the edges (in s) of the samples that they ask for."""
+        counts = (*self.shape.sampling.proposal_samples, self.shape.sampling.field_samples)
+        edges = samplers.uniform_edges(len(rays.origins), counts[0], self._jitter(rays, sampling), rays.origins)
+        histograms = []
+        for proposal, count in zip(self.proposals, counts[1:], strict=True):
+            edges_m = self.spacing.metres(edges)
+            with torch.set_grad_enabled(sampling.train_proposals and torch.is_grad_enabled()):
+                density = self._density(proposal, rays.points(edges_m))
+                weights = rendering.ray_weights(density, edges_m.diff(dim=-1))
+            histograms.append(Histogram(edges, weights))
+            flattened = weights.detach() ** sampling.anneal
+            jitter, padding = self._jitter(rays, sampling), self.shape.sampling.padding
+            edges = samplers.resample(edges, flattened, count, jitter, padding)
+        return tuple(histograms), edges
+
+    def query(self, points: Float[Tensor, "rays samples 3"], conditions: Float[Tensor, "rays _"]) -> PointValues:
+        """Density, colour and features at points of rays, with each ray's `conditions`."""
+        ray_count, sample_count, _ = points.shape
+        assignment, positions, inside = self._locate(points)
+        geometry = self.shape.settings.geometry_channels
+        density, geometry_values, hidden = self.trunk(positions, assignment).split(
+            [1, geometry, self.shape.settings.hidden_width], -1
+        )
+        of_rays = conditions.to(density.dtype).repeat_interleave(sample_count, 0)
+        seen = torch.cat([geometry_values, assignment.sort(of_rays)], -1)
+        rgb = torch.sigmoid(self.colour(seen, assignment.bounds).float())
+        features = self.semantics(torch.relu(hidden), assignment.bounds)
+        shape = ray_count, sample_count, -1
+        return PointValues(
+            assignment.restore(self._activate(density[:, 0], inside)).view(ray_count, sample_count),
+            assignment.restore(rgb).view(shape),
+            assignment.restore(features).float().view(shape),
+        )
+
+    def density(self, points: Float[Tensor, "rays samples 3"]) -> Float[Tensor, "rays samples"]:
+        """Density per metre at points."""
+        return self._density(self.trunk, points)
+
+    def proposal_densities(self, points: Float[Tensor, "rays samples 3"]) -> list[Float[Tensor, "rays samples"]]:
+        """Density per metre at points, as each proposal network guesses it."""
+        return [self._density(proposal, points) for proposal in self.proposals]
+
+    def conditions(self, rays: Rays) -> Float[Tensor, "rays _"]:
+        """What colour depends on beside the place: direction, video and image."""
+        embeddings = [
+            table.weight.mean(0).expand(len(rays.origins), -1) if numbers is None else table(numbers)
+            for table, numbers in ((self.video_embedding, rays.videos), (self.image_embedding, rays.images))
+        ]
+        return torch.cat([spherical_harmonics(rays.directions), *embeddings], -1)
+
+    def _density(self, network: nn.Module, points: Tensor) -> Tensor:
+        assignment, positions, inside = self._locate(points)
+        density = network(positions, assignment)[:, 0]
+        return assignment.restore(self._activate(density, inside)).view(points.shape[:-1])
+
+    def _activate(self, output: Tensor, inside: Tensor) -> Tensor:
+        """Density per metre of a network's output; nothing is beyond the grid."""
+        density = rendering.truncated_exponential(output.float() + self.shape.settings.density_bias)
+        return density * inside
+
+    def _locate(self, points: Tensor) -> tuple[Assignment, Tensor, Tensor]:
+        """The sorting by sub-field of points (..., 3), their grid positions (N, 3), and which have one."""
+        flat = points.reshape(-1, 3)
+        assignment = assign(flat, self.centroids)
+        centre, half = assignment.spread(self.box_centre), assignment.spread(self.box_half)
+        positions, inside = grid_position(assignment.sort(flat), centre, half)
+        return assignment, positions, inside
+
+    def _sky(self, rays: Rays, conditions: Tensor) -> tuple[Tensor, Tensor]:
+        """Colour (R, 3) and features (R, C) of the sky; the features ignore the video."""
+        assignment = assign(rays.origins, self.centroids)
+        seen = assignment.sort(conditions[:, : HARMONICS + self.shape.settings.video_embedding])
+        rgb = torch.sigmoid(self.sky_colour(seen, assignment.bounds).float())
+        features = self.sky_features(seen[:, :HARMONICS], assignment.bounds).float()
+        return assignment.restore(rgb), assignment.restore(features)
+
+    def _jitter(self, rays: Rays, sampling: Sampling) -> Tensor | None:
+        if sampling.generator is None:
+            return None
+        device = rays.origins.device
+        return torch.rand(len(rays.origins), 1, generator=sampling.generator, device=device)

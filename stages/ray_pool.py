@@ -1,0 +1,140 @@
+"""Rays for training and evaluation: pixels of many images, kept in memory for quick random access."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from presight_core import classes
+from presight_core.drives import FrameTable
+from presight_core.errors import InputError
+from presight_core.pixels import FramePixels, PixelSource
+
+DRAW_ROUNDS = 100  # of a batch each; images nine tenths of which are masked still fill a batch long before
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """Rays through pixels, and what the images show there."""
+
+    rows: NDArray[np.int64]  # (R,) of the frame table
+    origins_world: NDArray[np.float64]  # (R, 3) metres
+    directions_world: NDArray[np.float64]  # (R, 3) unit length
+    rgb: NDArray[np.uint8]  # (R, 3)
+    labels: NDArray[np.uint8]  # (R,) Cityscapes train ids, 255 unknown
+    features: NDArray[np.uint8]  # (R, C), 255 = 1.0
+
+    def select(self, mask: NDArray[np.bool_]) -> "PixelBatch":
+        """The rays of the mask."""
+        return PixelBatch(*(getattr(self, column.name)[mask] for column in fields(self)))
+
+    @staticmethod
+    def concatenate(batches: Sequence["PixelBatch"]) -> "PixelBatch":
+        """One batch of all rays, in the given order; at least one batch."""
+        columns = (column.name for column in fields(PixelBatch))
+        return PixelBatch(*(np.concatenate([getattr(batch, name) for batch in batches]) for name in columns))
+
+
+class RayPool:
+    """The decoded images of some rows of a frame table.
+
+    The grids of all images lie behind one another in one array a kind, so that pixels of any images are
+    fetched by one indexing.
+    """
+
+    def __init__(self, frames: FrameTable, source: PixelSource, rows: NDArray[np.int64], threads: int = 1) -> None:
+        """Decode the rows. Raises InputError if an image cannot be read."""
+        self.rows = np.asarray(rows, np.int64)
+        selected = frames.select(self.rows)
+        self._positions = selected.positions
+        rotations = selected.world_from_camera[:, :3, :3]
+        self._world_from_pixel = rotations @ np.linalg.inv(selected.intrinsics)  # directions, not yet of unit length
+        self._sizes_px = np.stack([selected.width_px, selected.height_px], -1).astype(np.float64)
+        with ThreadPoolExecutor(threads) as executor:
+            images = list(executor.map(source.load, self.rows.tolist()))
+        self._rgb = _Grids([image.rgb for image in images])
+        self._labels = _Grids([image.labels for image in images])
+        self._features = _Grids([image.features for image in images])
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the decoded images."""
+        return sum(grids.values.nbytes for grids in (self._rgb, self._labels, self._features))
+
+    def draw(self, count: int, groups: Sequence[NDArray[np.int64]], random: np.random.Generator) -> PixelBatch:
+        """Pixels at random: a group uniformly, an image (by its place in `rows`) of it, then a pixel of that."""
+        chosen = random.integers(len(groups), size=count)
+        sizes = np.array([len(group) for group in groups])
+        starts = np.cumsum(sizes) - sizes
+        within = (random.random(count) * sizes[chosen]).astype(np.int64)
+        images = np.concatenate(groups)[starts[chosen] + within]
+        shape = self._rgb.shapes[images]
+        return self.at(images, (random.random((count, 2)) * shape[:, ::-1]).astype(np.int64))
+
+    def at(self, images: NDArray[np.int64], pixels: NDArray[np.int64]) -> PixelBatch:
+        """Pixels (R, 2), column and row at the working resolution, of images by their place in `rows`."""
+        unit = (pixels + 0.5) / self._rgb.shapes[images][:, ::-1]
+        full = np.concatenate([unit * self._sizes_px[images], np.ones((len(images), 1))], -1)
+        directions = np.einsum("nij,nj->ni", self._world_from_pixel[images], full)
+        return PixelBatch(
+            self.rows[images],
+            self._positions[images],
+            directions / np.linalg.norm(directions, axis=-1, keepdims=True),
+            self._rgb.at(images, unit),
+            self._labels.at(images, unit),
+            self._features.at(images, unit),
+        )
+
+    def size_px(self, image: int) -> tuple[int, int]:
+        """Width and height of an image at the working resolution."""
+        height, width = self._rgb.shapes[image]
+        return int(width), int(height)
+
+
+def draw_static(
+    pool: RayPool,
+    count: int,
+    groups: Sequence[NDArray[np.int64]],
+    random: np.random.Generator,
+    dynamic_classes: tuple[str, ...],
+) -> PixelBatch:
+    """`count` random pixels that show nothing of the given classes.
+
+    Raises InputError if the images show hardly anything else.
+    """
+    is_dynamic = classes.lookup(dynamic_classes)
+    batches, missing = [], count
+    for _ in range(DRAW_ROUNDS):
+        batch = pool.draw(count + count // 4, groups, random)  # a quarter more: traffic rarely covers more than that
+        batch = batch.select(~is_dynamic[batch.labels])
+        batches.append(batch.select(np.arange(len(batch.rows)) < missing))
+        missing -= len(batches[-1].rows)
+        if not missing:
+            return PixelBatch.concatenate(batches)
+    raise InputError(
+        f"{len(pool.rows)} images show hardly anything but {', '.join(dynamic_classes)}; "
+        "check their label maps, or shorten features.dynamic_classes"
+    )
+
+
+def bytes_of(image: FramePixels) -> int:
+    """Memory of one decoded image."""
+    return image.rgb.nbytes + image.labels.nbytes + image.features.nbytes
+
+
+class _Grids:
+    """Grids (rows, columns, ...) of many images, flattened behind one another."""
+
+    def __init__(self, grids: list[NDArray[np.uint8]]) -> None:
+        self.shapes = np.array([grid.shape[:2] for grid in grids], np.int64)
+        sizes = self.shapes.prod(-1)
+        self._starts = np.cumsum(sizes) - sizes
+        self.values = np.concatenate([grid.reshape(-1, *grid.shape[2:]) for grid in grids])
+        grids.clear()
+
+    def at(self, images: NDArray[np.int64], unit: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Values (R, ...) of the cells that hold places (R, 2), x and y in 0..1 of the image."""
+        rows, columns = (unit[:, ::-1] * self.shapes[images]).astype(np.int64).T
+        return self.values[self._starts[images] + rows * self.shapes[images, 1] + columns]

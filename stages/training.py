@@ -1,0 +1,320 @@
+"""Training: one tile's field, from the pixels of its frames."""
+
+import hashlib
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from presight_core import classes
+from presight_core.config import CitySettings, TrainingSettings
+from presight_core.drives import FrameTable
+from presight_core.errors import BuildError, InputError, NotFoundError
+from presight_core.field import checkpoint, losses, schedule, threads
+from presight_core.field.tile_field import FieldShape, Rays, Rendering, Sampling, TileField
+from presight_core.pixels import PixelSource
+from presight_core.progress import Progress, Report, silent
+from presight_core.recipes import Recipe
+from presight_core.tiles import SubField
+from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
+
+VERSION = 1  # raised whenever the same inputs give another field
+REPORT_SECONDS = 0.5
+POOL_BYTES = 3 << 30  # of decoded images in memory
+POOL_STEPS = 250  # a pool that cannot hold all images is drawn anew this often (released code: about 280)
+PULSE_WIDTHS = (0.03, 0.003)  # of the blurred interlevel loss, coarse proposal first (released code)
+
+
+@dataclass(frozen=True)
+class TileTraining:
+    """What one tile's training needs beside the pixels. `frames` are all frames of the tile, held-out ones too."""
+
+    tile_id: str
+    frames: FrameTable
+    sub_fields: tuple[SubField, ...]
+    settings: CitySettings
+    feature_channels: int
+    threads: int = 1
+    device: str = "cpu"
+
+    @property
+    def recipe(self) -> Recipe:
+        """Everything that decides the trained field, pixels aside."""
+        frames, chosen = self.frames, ("field", "sampling", "training")
+        digest = hashlib.sha256()
+        for column in (frames.drive_id, frames.path, frames.intrinsics, frames.world_from_camera):
+            digest.update(np.ascontiguousarray(column).tobytes())
+        inputs = {
+            "frames": digest.hexdigest(),
+            "sub_fields": [sub_field.to_json() for sub_field in self.sub_fields],
+            "feature_channels": self.feature_channels,
+            "dynamic_classes": list(self.settings.features.dynamic_classes),
+        }
+        settings = {name: getattr(self.settings, name).model_dump(mode="json") for name in chosen}
+        return Recipe("training", VERSION, settings, inputs)
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """Where the field lies (see `load_field`), and loss, psnr_db and rays_per_s of the end of training."""
+
+    folder: Path
+    metrics: dict[str, float]
+
+
+def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Report = silent) -> TrainingResult:
+    """Train one tile's field; resumes from `scratch` where its checkpoint has the same recipe.
+
+    Random numbers depend on the seed and the step alone, so an interrupted training ends as an
+    uninterrupted one would. Raises InputError if there is nothing to train on or an image cannot be
+    read, BuildError if the loss stops being a number.
+    """
+    threads.use_threads(job.threads)
+    threads.keep_freed_memory()
+    rows = training_rows(job.frames, job.settings.training)
+    if not len(rows):
+        raise InputError(f"tile {job.tile_id}: none of its {len(job.frames)} frames is for training; ingest more")
+    run = _Run(job, scratch)
+    pools = _Pools(job, source, rows)
+    log = _Log(job, scratch, report)
+    settings = job.settings.training
+    for step in range(run.step, settings.steps):
+        pool, groups = pools.at(step)
+        batch = draw_static(
+            pool, settings.batch_rays, groups, _random(settings, step), job.settings.features.dynamic_classes
+        )
+        log.add(step, run.train(step, batch))
+        if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
+            log.flush(step)
+            run.save(step + 1, log.figures)
+    checkpoint.save_field(scratch / "field", run.field)
+    return TrainingResult(scratch / "field", run.metrics)
+
+
+def training_rows(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.int64]:
+    """Rows that a tile trains on."""
+    rows, held_out = _split(frames, settings)
+    return rows[~held_out]
+
+
+def holdout_rows(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.int64]:
+    """Rows that a tile is evaluated on."""
+    rows, held_out = _split(frames, settings)
+    return rows[held_out]
+
+
+def holdout_mask(frames: FrameTable, every: int) -> NDArray[np.bool_]:
+    """Which frames are held out: every `every`-th of each camera of each drive, from the middle of each stretch.
+
+    From the middle, so that neighbours on both sides are trained on. 0 holds nothing out.
+    """
+    mask = np.zeros(len(frames), np.bool_)
+    if not every:
+        return mask
+    names = np.char.add(np.char.add(frames.drive_id, "\n"), frames.camera)
+    for name in np.unique(names):
+        rows = np.flatnonzero(names == name)
+        rows = rows[np.argsort(frames.timestamp_us[rows], kind="stable")]
+        mask[rows[every // 2 :: every]] = True
+    return mask
+
+
+def video_numbers(frames: FrameTable) -> NDArray[np.int64]:
+    """The number of each frame's video (drive) in the field's embedding."""
+    return np.unique(frames.drive_id, return_inverse=True)[1].astype(np.int64)
+
+
+def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The rows in use, and which of them are held out."""
+    rows = np.flatnonzero(frames.is_keyframe) if settings.keyframes_only else np.arange(len(frames))
+    return rows, holdout_mask(frames.select(rows), settings.holdout_every)
+
+
+def _random(settings: TrainingSettings, step: int) -> np.random.Generator:
+    return np.random.default_rng([settings.seed, step])
+
+
+class _Pools:
+    """The pool of each step: all images if they fit into memory, else a random part that changes now and then."""
+
+    def __init__(self, job: TileTraining, source: PixelSource, rows: NDArray[np.int64]) -> None:
+        self._job, self._source, self._rows = job, source, rows
+        centroids = np.array([sub_field.centroid_m for sub_field in job.sub_fields])
+        offsets = job.frames.positions[rows][:, None] - centroids[None]
+        self._sub_field = np.linalg.norm(offsets, axis=-1).argmin(-1)
+        self._capacity = max(1, POOL_BYTES // bytes_of(source.load(int(rows[0]))))
+        self._epoch = -1
+
+    def at(self, step: int) -> tuple[RayPool, list[NDArray[np.int64]]]:
+        """The pool of a step, and its images grouped by sub-field."""
+        epoch = 0 if len(self._rows) <= self._capacity else step // POOL_STEPS
+        if epoch != self._epoch:
+            self._epoch = epoch
+            chosen = self._choose(epoch)
+            self._pool = RayPool(self._job.frames, self._source, self._rows[chosen], self._job.threads)
+            owner = self._sub_field[chosen]
+            self._groups = [np.flatnonzero(owner == sub_field) for sub_field in np.unique(owner)]
+        return self._pool, self._groups
+
+    def _choose(self, epoch: int) -> NDArray[np.int64]:
+        """Places in `rows` of the pool's images, as many of each sub-field as there is room for."""
+        if len(self._rows) <= self._capacity:
+            return np.arange(len(self._rows))
+        random = np.random.default_rng([self._job.settings.training.seed, epoch, 1])  # 1: apart from the steps'
+        order = random.permutation(len(self._rows))
+        rank = np.empty(len(order), np.int64)  # how many of its sub-field come before each
+        for sub_field in np.unique(self._sub_field):
+            places = np.flatnonzero(self._sub_field[order] == sub_field)
+            rank[places] = np.arange(len(places))
+        return np.sort(order[np.argsort(rank, kind="stable")[: self._capacity]])
+
+
+class _Run:
+    """A field in training: its parameters, its optimiser, and their checkpoint."""
+
+    def __init__(self, job: TileTraining, scratch: Path) -> None:
+        self.step, self.metrics = 0, {}
+        self._job, self._settings = job, job.settings.training
+        self._file = scratch / "training.safetensors"
+        self._videos = video_numbers(job.frames)
+        self.field = _new_field(job, int(self._videos.max()) + 1)
+        self._names = {id(parameter): name for name, parameter in self.field.named_parameters()}
+        is_table = {id(parameter): name.endswith("grid.table") for name, parameter in self.field.named_parameters()}
+        tables = [parameter for parameter in self.field.parameters() if is_table[id(parameter)]]
+        others = [parameter for parameter in self.field.parameters() if not is_table[id(parameter)]]
+        groups = [{"params": tables, "weight_decay": 0.0}, {"params": others}]
+        # 1e-15 (Instant-NGP): a hash row's gradients are tiny and rare, the usual 1e-8 would swallow them.
+        self._optimiser = torch.optim.AdamW(groups, weight_decay=self._settings.weight_decay, eps=1e-15, fused=True)
+        self._generator = torch.Generator(job.device)
+        self._resume()
+
+    def train(self, step: int, batch: PixelBatch) -> dict[str, Tensor]:
+        """One step of the optimiser; its losses by name."""
+        for group in self._optimiser.param_groups:
+            group["lr"] = schedule.learning_rate(step, self._settings)
+        # Torch's seed must depend on both: consecutive seeds of the same run never meet those of another.
+        self._generator.manual_seed(self._settings.seed << 32 | step)
+        trains_proposals = schedule.trains_proposals(step, self._settings)
+        sampling = Sampling(self._generator, schedule.anneal_exponent(step, self._settings), trains_proposals)
+        parts = self._losses(self.field(self._rays(batch), sampling), batch, trains_proposals)
+        torch.stack(list(parts.values())).sum().backward()
+        self._optimiser.step()
+        self._optimiser.zero_grad()
+        return {name: part.detach() for name, part in parts.items()}
+
+    def save(self, step: int, figures: dict[str, float]) -> None:
+        """Make the state after `step` steps durable."""
+        self.step, self.metrics = step, figures
+        tensors = {f"field/{name}": tensor for name, tensor in self.field.state_dict().items()}
+        tensors |= {
+            f"{quantity}/{self._names[id(parameter)]}": tensor
+            for parameter, state in self._optimiser.state.items()
+            for quantity, tensor in state.items()
+        }
+        header = {"recipe": self._job.recipe.digest, "step": step, "metrics": figures}
+        checkpoint.save_tensors(self._file, tensors, header)
+
+    def _resume(self) -> None:
+        try:
+            tensors, header = checkpoint.load_tensors(self._file, self._job.device)
+        except (NotFoundError, InputError):  # none yet, or unreadable: start over
+            return
+        if header["recipe"] != self._job.recipe.digest:
+            return
+        self.step, self.metrics = header["step"], header["metrics"]
+        state: dict[str, dict[str, Tensor]] = {}
+        for key, tensor in tensors.items():
+            quantity, name = key.split("/", 1)
+            state.setdefault(quantity, {})[name] = tensor
+        self.field.load_state_dict(state.pop("field"))
+        for name, parameter in self.field.named_parameters():
+            self._optimiser.state[parameter] = {quantity: values[name] for quantity, values in state.items()}
+
+    def _rays(self, batch: PixelBatch) -> Rays:
+        return self.field.rays(batch.origins_world, batch.directions_world, self._videos[batch.rows], batch.rows)
+
+    def _losses(self, rendering: Rendering, batch: PixelBatch, trains_proposals: bool) -> dict[str, Tensor]:
+        """The five losses (paper, section 3.2), weighted."""
+        weights = self._settings.loss
+        rgb, features, labels = (
+            torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.features, batch.labels)
+        )
+        known = labels != classes.UNKNOWN
+        parts = {
+            "rgb": functional.mse_loss(rendering.rgb, rgb / 255),
+            "features": weights.features * losses.feature_loss(rendering.features, features / 255),
+            "sky": weights.sky * losses.sky_loss(rendering.accumulation[known], labels[known] == classes.SKY),
+            "distortion": weights.distortion * losses.distortion_loss(rendering.field.edges, rendering.field.weights),
+        }
+        if trains_proposals:
+            parts["interlevel"] = weights.interlevel * _interlevel(rendering)
+        return parts
+
+
+def _new_field(job: TileTraining, video_count: int) -> TileField:
+    """A field with random parameters that depend on the seed alone."""
+    settings = job.settings
+    shape = FieldShape(
+        job.sub_fields, settings.field, settings.sampling, job.feature_channels, video_count, len(job.frames)
+    )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.training.seed)
+        field = TileField(shape).to(job.device)
+    if settings.training.bfloat16 and threads.has_fast_bfloat16(job.device):
+        field.use_dtype(torch.bfloat16)
+    return field
+
+
+def _interlevel(rendering: Rendering) -> Tensor:
+    field = rendering.field
+    parts = [
+        losses.blurred_interlevel_loss(field.edges, field.weights, proposal.edges, proposal.weights, width)
+        for proposal, width in zip(rendering.proposals, PULSE_WIDTHS, strict=False)
+    ]
+    return torch.stack(parts).sum()
+
+
+class _Log:
+    """Losses of the latest steps, on their way to the caller and to TensorBoard."""
+
+    def __init__(self, job: TileTraining, scratch: Path, report: Report) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.figures: dict[str, float] = {}
+        self._job, self._report = job, report
+        self._writer = SummaryWriter(scratch / "tensorboard")
+        self._sums: dict[str, Tensor] = {}
+        self._steps = 0
+        self._started = time.perf_counter()
+
+    def add(self, step: int, parts: dict[str, Tensor]) -> None:
+        """Note a step's losses; every half second they are reported."""
+        for name, part in parts.items():
+            self._sums[name] = self._sums.get(name, torch.zeros_like(part)) + part
+        self._steps += 1
+        if time.perf_counter() - self._started > REPORT_SECONDS:
+            self.flush(step)
+
+    def flush(self, step: int) -> None:
+        """Report the mean of the steps since the last report. Raises BuildError if it is not a number."""
+        if not self._steps:
+            return
+        seconds = time.perf_counter() - self._started
+        means = {name: float(total) / self._steps for name, total in self._sums.items()}
+        loss = sum(means.values())
+        if not np.isfinite(loss):
+            rate = self._job.settings.training.learning_rate
+            raise BuildError(
+                f"tile {self._job.tile_id}: the loss is {loss} at step {step}; lower training.learning_rate ({rate})"
+            )
+        rays_per_s = self._steps * self._job.settings.training.batch_rays / seconds
+        self.figures = {"loss": loss, "psnr_db": -10 * float(np.log10(means["rgb"])), "rays_per_s": rays_per_s}
+        for name, value in {**{f"loss/{name}": mean for name, mean in means.items()}, **self.figures}.items():
+            self._writer.add_scalar(name, value, step + 1)
+        self._report(Progress("training", step + 1, self._job.settings.training.steps, dict(self.figures)))
+        self._sums, self._steps, self._started = {}, 0, time.perf_counter()
