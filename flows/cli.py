@@ -1,5 +1,165 @@
-"""The `presight` command."""
+"""The `presight` command. Every import that costs time happens inside the command that needs it."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from presight_core.errors import PresightError
+
+app = typer.Typer(
+    help="Turn the camera logs of past drives into a city's neural prior.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+City = Annotated[
+    str, typer.Argument(help="City: the log location, for example singapore-onenorth.", show_default=False)
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, for example training.steps=2000."),
+]
+Shown = Annotated[int | None, typer.Option("--generation", help="Generation to read; the newest if not given.")]
+
+
+@app.callback()
+def options(
+    context: typer.Context,
+    workspace: Annotated[
+        Path, typer.Option(envvar="PRESIGHT_WORKSPACE", help="Folder of catalog, caches and store.")
+    ] = Path("workspace"),
+) -> None:
+    """Turn the camera logs of past drives into a city's neural prior."""
+    context.obj = workspace
+
+
+@app.command()
+def ingest(
+    context: typer.Context,
+    root: Annotated[Path, typer.Argument(help="Root of a data set in nuScenes format.", show_default=False)],
+    version: Annotated[str, typer.Option(help="Folder of its tables, for example v1.0-trainval.")] = "v1.0-trainval",
+    keep_going: Annotated[
+        bool, typer.Option("--keep-going", help="Ingest the good frames of drives that have bad ones.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Check and index the drives of a data set. Ingesting the same content again changes nothing."""
+    from flows.ingest import ingest_root
+
+    ingest_root(context.obj, root, version, keep_going, as_json)
+
+
+@app.command()
+def plan(context: typer.Context, city: City, override: Overrides = None, as_json: AsJson = False) -> None:
+    """Show a city's tiles, which are stale and why, and what building them costs."""
+    from flows.plan import show_plan
+
+    show_plan(context.obj, city, override or [], as_json)
+
+
+@app.command()
+def build(
+    context: typer.Context,
+    city: City,
+    override: Overrides = None,
+    parallel: Annotated[
+        int | None, typer.Option(min=1, help="Tiles at once; as many as GPUs, or else cores, if not given.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Build and publish what is stale of a city: features, training, extraction, validation."""
+    from flows.build import build_city
+
+    build_city(context.obj, city, override or [], parallel, as_json)
+
+
+@app.command()
+def status(
+    context: typer.Context,
+    city: Annotated[str | None, typer.Argument(help="City; all cities if not given.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the state of every tile."""
+    from flows.status import show_status
+
+    show_status(context.obj, city, as_json)
+
+
+@app.command()
+def query(
+    context: typer.Context,
+    city: City,
+    at: Annotated[
+        str, typer.Option(metavar="X,Y,YAW", help="Pose: world metres, degrees counter-clockwise from east.")
+    ],
+    extent: Annotated[
+        str, typer.Option("--range", metavar="LENGTHxWIDTH", help="Window around the pose, metres.")
+    ] = "100x50",
+    png: Annotated[Path | None, typer.Option(help="Draw the prior from above into this file.")] = None,
+    generation: Shown = None,
+    as_json: AsJson = False,
+) -> None:
+    """Read the prior around a pose."""
+    from flows.query import Place, show_window
+
+    show_window(context.obj, city, generation, Place.parse(at, extent), png, as_json)
+
+
+@app.command()
+def report(
+    context: typer.Context,
+    city: City,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the report; <workspace>/reports/CITY if not given.")
+    ] = None,
+) -> None:
+    """Write a one-page HTML report of a city with its pictures."""
+    from flows.report import write_report
+
+    print(write_report(context.obj, city, out))
+
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Argument(help="Folder of the new data set.", show_default=False)],
+    preset: Annotated[str, typer.Option(help="ci, demo or experiment.")] = "demo",
+    seed: Annotated[int, typer.Option(help="Seed: the same seed gives the same city.")] = 0,
+) -> None:
+    """Generate the embedded city: a procedural data set in nuScenes format with ground truth."""
+    from flows.demo import generate_city
+
+    generate_city(out, preset, seed)
+
+
+@app.command()
+def demo(context: typer.Context, override: Overrides = None) -> None:
+    """Generate the small embedded city, build its priors and show them."""
+    from flows.demo import run_demo
+
+    run_demo(context.obj, override or [])
+
+
+@app.command()
+def doctor(context: typer.Context, as_json: AsJson = False) -> None:
+    """Show what is installed, what is missing and how to get it."""
+    from flows.doctor import show_findings
+
+    show_findings(context.obj, as_json)
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line; one clear line and a telling exit code for every error that is ours."""
+    try:
+        app()
+    except PresightError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""`presight build`: plan, and run the flow only if something is stale."""
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from flows.console import print_json
+from flows.plan import CityPlan, plan_city
+from presight_core.config import load_city_settings
+from presight_core.errors import BuildError
+from storage.workspace import Workspace
+
+# The embedded Prefect server needs 14-29 s on a cold start, more on a busy machine; it reports to nobody.
+PREFECT_ENVIRONMENT = {
+    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "DO_NOT_TRACK": "1",
+    "PREFECT_LOGGING_LEVEL": "CRITICAL",
+}
+
+
+def build_city(folder: Path, city: str, overrides: list[str], parallel: int | None, as_json: bool) -> None:
+    """Build what is stale of a city and say what became of it. Raises BuildError if a tile failed."""
+    started = time.monotonic()
+    workspace = Workspace.open(folder).require()
+    plan = plan_city(workspace, city, load_city_settings(workspace.city_file(city), overrides))
+    if plan.stale:
+        outcome = _run(workspace, plan, overrides, parallel)
+    else:
+        outcome = {"generation": plan.generation, "published": [], "failed": {}}
+    outcome["seconds"] = round(time.monotonic() - started, 1)
+    if as_json:
+        print_json(outcome)
+    else:
+        _print(city, outcome)
+    if outcome["failed"]:
+        raise BuildError(
+            f"{city}: {len(outcome['failed'])} tiles failed and keep their old state; see `presight status {city}`"
+        )
+
+
+def _run(workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None) -> dict[str, Any]:
+    for name, value in PREFECT_ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    from flows.city import run_city
+    from flows.display import watch_builds
+
+    print(f"{plan.city}: starting the flow", file=sys.stderr)
+    with watch_builds(workspace.catalog(), plan.city):
+        return run_city(workspace, plan, overrides, parallel)
+
+
+def _print(city: str, outcome: dict[str, Any]) -> None:
+    if not outcome["published"] and not outcome["failed"]:
+        print(f"{city}: nothing stale; generation {outcome['generation']} is current ({outcome['seconds']} s)")
+        return
+    for tile_id, error in outcome["failed"].items():
+        print(f"{tile_id}: failed: {error.splitlines()[0]}")
+    tiles = ", ".join(outcome["published"]) or "no tile"
+    print(f"{city}: published {tiles} as generation {outcome['generation']} ({outcome['seconds']} s)")
+    print(f"next: presight status {city}; presight report {city}")

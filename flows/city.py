@@ -1,0 +1,147 @@
+"""The flow `rebuild_city`: everything stale of one city, tiles in parallel, one published generation."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+from prefect.task_runners import ThreadPoolTaskRunner
+
+from flows import tasks
+from flows.jobs import Job
+from flows.plan import CityPlan, plan_city
+from flows.publication import Built, publish
+from presight_core.config import load_city_settings
+from presight_core.recipes import Recipe
+from storage.workspace import Workspace
+
+CITY_ROW = "city"  # the catalog's row of what belongs to no tile: the feature space and the features
+
+
+@flow(name="rebuild_city", flow_run_name="rebuild {city}", persist_result=False)
+def rebuild_city(
+    workspace: str, city: str, overrides: list[str] | None = None, threads: int = 1, devices: list[str] | None = None
+) -> dict[str, Any]:
+    """Build and publish what is stale. A tile that fails keeps its old build and is named in the result."""
+    opened = Workspace.open(Path(workspace))
+    settings = load_city_settings(opened.city_file(city), overrides or ())
+    plan = plan_city(opened, city, settings)
+    if plan.stale and plan.space_id is None:
+        _fit_space(opened, plan, threads)
+        plan = plan_city(opened, city, settings)
+    if not plan.stale:
+        return {"generation": plan.generation, "published": [], "failed": {}}
+    _freeze(opened, plan)
+    broken = _extract_features(opened, plan, threads)
+    built, failed = _build_tiles(_tile_jobs(opened, plan, threads, devices or ["cpu"]), broken)
+    return publish(opened, plan, built, failed)
+
+
+def run_city(workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None) -> dict[str, Any]:
+    """Run the flow on this machine, as many tiles at once as it has GPUs, or else cores."""
+    devices = available_devices()
+    cores = len(os.sched_getaffinity(0))
+    wanted = parallel or (cores if devices == ["cpu"] else len(devices))
+    at_once = max(1, min(wanted, len(plan.stale)))
+    run = rebuild_city.with_options(task_runner=ThreadPoolTaskRunner(max_workers=at_once))
+    return run(str(workspace.root), plan.city, overrides, max(1, cores // at_once), devices)
+
+
+def available_devices() -> list[str]:
+    """The GPUs of this machine, or else its processor."""
+    import torch
+
+    return [f"cuda:{index}" for index in range(torch.cuda.device_count())] or ["cpu"]
+
+
+def _freeze(workspace: Workspace, plan: CityPlan) -> None:
+    """Fix what every later build of the city must share: its tiling, its lattice and its feature space."""
+    assert plan.space_id is not None
+    workspace.catalog().save_tiling(plan.tiling, plan.settings.tiling.model_dump(mode="json"))
+    channels = workspace.artifacts().space(plan.space_id).channel_count
+    workspace.store().create_city(plan.city, plan.lattice, plan.space_id, channels)
+
+
+def _fit_space(workspace: Workspace, plan: CityPlan, threads: int) -> None:
+    catalog = workspace.catalog()
+    drive_ids = tuple(drive.drive_id for drive in plan.drives)
+    build_id = catalog.start_build(plan.city, CITY_ROW, Recipe("space", 1, {}, {"drives": list(drive_ids)}))
+    try:
+        tasks.fit_space(replace(_job(workspace, plan, build_id, threads), drive_ids=drive_ids))
+    except Exception as error:
+        catalog.finish_build(build_id, "failed", {}, str(error))
+        raise
+    catalog.finish_build(build_id, "built", {})
+
+
+def _extract_features(workspace: Workspace, plan: CityPlan, threads: int) -> dict[str, str]:
+    """Features of every drive that a stale tile needs; the error of each drive that has none, by drive id."""
+    assert plan.features is not None
+    cache, catalog = workspace.features(), workspace.catalog()
+    needed = sorted({drive_id for tile in plan.stale for drive_id in tile.drive_ids})
+    missing = [drive_id for drive_id in needed if not cache.is_complete(plan.features.digest, drive_id)]
+    if not missing:
+        return {}
+    build_id = catalog.start_build(plan.city, CITY_ROW, plan.features)
+    job = _job(workspace, plan, build_id, threads)
+    broken: dict[str, str] = {}
+    for drive_id in missing:  # one after the other: a session uses all threads, and the disk is the limit
+        state = tasks.extract_features(replace(job, drive_ids=(drive_id,)), return_state=True)
+        if state.is_failed():
+            broken[drive_id] = str(state.result(raise_on_failure=False))
+    catalog.finish_build(build_id, "failed" if broken else "built", {}, "; ".join(broken.values()))
+    return broken
+
+
+def _tile_jobs(workspace: Workspace, plan: CityPlan, threads: int, devices: list[str]) -> dict[str, Job]:
+    """A job for every stale tile, each with a row in the catalog."""
+    jobs = {}
+    for index, tile in enumerate(plan.stale):
+        assert tile.recipe is not None
+        assert tile.training is not None
+        build_id = workspace.catalog().start_build(plan.city, tile.tile_id, tile.recipe)
+        jobs[tile.tile_id] = replace(
+            _job(workspace, plan, build_id, threads),
+            device=devices[index % len(devices)],
+            drive_ids=tile.drive_ids,
+            tile=tile.tile,
+            training_recipe=tile.training.to_json(),
+            recipe=tile.recipe.to_json(),
+        )
+    return jobs
+
+
+def _job(workspace: Workspace, plan: CityPlan, build_id: int, threads: int) -> Job:
+    return Job(
+        workspace=str(workspace.root),
+        city=plan.city,
+        build_id=build_id,
+        settings=plan.settings.model_dump(mode="json"),
+        threads=threads,
+        space_id=plan.space_id or "",
+        features_recipe=plan.features.to_json() if plan.features else {},
+        tiling=plan.tiling.to_json(),
+    )
+
+
+def _build_tiles(jobs: dict[str, Job], broken: dict[str, str]) -> tuple[list[Built], dict[str, tuple[Job, str]]]:
+    """Train and extract all tiles in parallel: what was built, and the job and error of each tile that was not."""
+    failed = {
+        tile_id: (job, next(broken[drive_id] for drive_id in job.drive_ids if drive_id in broken))
+        for tile_id, job in jobs.items()
+        if broken.keys() & set(job.drive_ids)
+    }
+    trained = {tile_id: tasks.train_tile.submit(job) for tile_id, job in jobs.items() if tile_id not in failed}
+    # Extractions queue behind all trainings, so that none holds a thread while it waits for its field.
+    extracted = {
+        tile_id: tasks.extract_tile.submit(jobs[tile_id], wait_for=[future])
+        for tile_id, future in trained.items()
+    }
+    built = []
+    for tile_id, future in trained.items():
+        try:
+            built.append(Built(jobs[tile_id], future.result(), extracted[tile_id].result()))
+        except Exception as error:  # whatever it was, it must not sink the other tiles
+            failed[tile_id] = (jobs[tile_id], f"{type(error).__name__}: {error}")
+    return built, failed

@@ -1,0 +1,36 @@
+"""`presight synth` and `presight demo`: the embedded city, and its priors from nothing."""
+
+import time
+from pathlib import Path
+
+from flows.console import progress_bars
+
+CITY = "singapore-onenorth"  # official map names only, so that the official devkit can load the data set
+VERSION = "v1.0-mini"
+
+
+def generate_city(out: Path, preset: str, seed: int) -> None:
+    """Write the embedded city to `out`, going on where an earlier call was interrupted."""
+    from presight_core.synthetic import write_dataset
+
+    with progress_bars() as report:
+        write_dataset(out, preset, seed, report)
+    print(f"{out}: a city in nuScenes format; next: presight ingest {out} --version {VERSION}")
+
+
+def run_demo(folder: Path, overrides: list[str]) -> None:
+    """Generate the small city, build its priors through the flow, draw them, and say where to look."""
+    from flows.build import build_city
+    from flows.ingest import ingest_root
+    from flows.report import write_report
+    from flows.status import show_status
+
+    started = time.monotonic()
+    data = folder / "embedded-city"
+    generate_city(data, "demo", seed=0)
+    ingest_root(folder, data, VERSION, keep_going=False, as_json=False)
+    build_city(folder, CITY, ["preset=demo", *overrides], parallel=None, as_json=False)
+    show_status(folder, CITY, as_json=False)
+    page = write_report(folder, CITY, None)
+    print(f"done in {time.monotonic() - started:.0f} s; look at {page}")
+    print(f"ask it:  presight --workspace {folder} query {CITY} --at X,Y,YAW --png prior.png")

@@ -1,0 +1,70 @@
+"""Publishing: which of the built tiles may be shown, and the one generation that shows them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from stages.validation import validate_tile
+
+from flows.jobs import Job
+from flows.plan import CityPlan
+from presight_core.priors.documents import Generation, GenerationTile, TileEntry
+from storage.priors import PriorStore
+from storage.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Built:
+    """A tile that was trained and extracted: its job and what the two workers said."""
+
+    job: Job
+    trained: dict[str, Any]
+    extracted: dict[str, Any]
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The tile's figures, for validation, the catalog and the generation."""
+        entry, trained = self.extracted["entry"], self.trained["metrics"]
+        counts = {f"extraction_{name}": count for name, count in self.extracted["counts"].items()}
+        seconds = round(trained.get("seconds", 0.0) + self.extracted["seconds"], 1)
+        return {**trained, **counts, "voxels": entry["voxel_count"], "bytes": entry["bytes"], "seconds": seconds}
+
+    @property
+    def tile(self) -> GenerationTile:
+        """The tile as a generation shows it."""
+        return GenerationTile(TileEntry.from_json(self.extracted["entry"]), self.job.recipe, {"metrics": self.metrics})
+
+
+def publish(
+    workspace: Workspace, plan: CityPlan, built: list[Built], failed: dict[str, tuple[Job, str]]
+) -> dict[str, Any]:
+    """Publish what passes validation as one generation, and write every tile's end into the catalog."""
+    store, catalog = workspace.store(), workspace.catalog()
+    old = store.generation(plan.city)
+    accepted = []
+    for tile in built:
+        problems = _problems(store, plan, tile, old)
+        if problems:
+            failed[tile.job.tile_id] = (tile.job, "not published: " + "; ".join(problems))
+        else:
+            accepted.append(tile)
+    number = plan.generation
+    if accepted:
+        tiles = {tile.job.tile_id: tile.tile for tile in accepted}
+        number = store.publish(plan.city, tiles, plan.generation, plan.tiling.to_json())
+    for tile in accepted:
+        catalog.finish_build(tile.job.build_id, "published", {**tile.metrics, "generation": number})
+    for job, error in failed.values():
+        catalog.finish_build(job.build_id, "failed", {}, error)
+    return {
+        "generation": number,
+        "published": [tile.job.tile_id for tile in accepted],
+        "failed": {tile_id: error for tile_id, (_, error) in failed.items()},
+    }
+
+
+def _problems(store: PriorStore, plan: CityPlan, tile: Built, old: Generation | None) -> tuple[str, ...]:
+    """Why a built tile may not be published."""
+    shown = old.tiles.get(tile.job.tile_id) if old else None
+    new_summary = store.summary(plan.city, tile.tile)
+    old_summary = store.summary(plan.city, shown) if shown else None
+    return validate_tile(new_summary, tile.metrics, old_summary, plan.settings.validation)

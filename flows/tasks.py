@@ -1,0 +1,62 @@
+"""The Prefect tasks: a stage of a tile or a drive each. They give order and retries; workers do the arithmetic.
+
+Parameters and results are references and small figures (JSON), never arrays.
+"""
+
+from typing import Any
+
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+
+from flows.jobs import Job
+from flows.launch import WorkerLostError, run_job
+from presight_core.errors import ConflictError
+from presight_core.progress import Progress
+
+
+def only_time_can_cure(_task: Any, _run: Any, state: Any) -> bool:
+    """Whether a failure may pass by itself: a lost race or a killed worker, never bad data or settings."""
+    return isinstance(getattr(state.data, "result", state.data), WorkerLostError | ConflictError)
+
+
+# The catalog holds the truth, so Prefect neither caches nor persists results.
+OPTIONS: dict[str, Any] = {
+    "cache_policy": NO_CACHE,
+    "persist_result": False,
+    "retries": 1,
+    "retry_condition_fn": only_time_can_cure,
+}
+
+
+@task(name="fit-space", tags=["cpu"], **OPTIONS)
+def fit_space(job: Job) -> dict[str, Any]:
+    """Fit and freeze the feature space of the job's models."""
+    return _work("fit-space", job)
+
+
+@task(name="extract-features", task_run_name="features of {job.drive_ids[0]}", tags=["cpu"], **OPTIONS)
+def extract_features(job: Job) -> dict[str, Any]:
+    """Label maps and features of one drive, into the cache."""
+    return _work("features", job)
+
+
+@task(name="train-tile", task_run_name="train {job.tile_id}", tags=["gpu"], **OPTIONS)
+def train_tile(job: Job) -> dict[str, Any]:
+    """Train and evaluate one tile's field."""
+    return _work("train", job)
+
+
+@task(name="extract-tile", task_run_name="extract {job.tile_id}", tags=["gpu"], **OPTIONS)
+def extract_tile(job: Job) -> dict[str, Any]:
+    """Turn one tile's field into voxels, written but not yet published."""
+    return _work("extract", job)
+
+
+def _work(command: str, job: Job) -> dict[str, Any]:
+    """Run a job and let the catalog know how far it is."""
+    catalog = job.opened_workspace.catalog()
+
+    def report(progress: Progress) -> None:
+        catalog.progress(job.build_id, progress)
+
+    return run_job(command, job, report)
