@@ -20,6 +20,7 @@ PANEL_PX = 640  # longer side of a bird's-eye panel: three of them fit a wide sc
 LEGEND_PX = 24  # strip below a bird's-eye panel for scale and north
 NORTH_RADIUS_PX = 9
 STEPS_M = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # lengths of a scale bar that people can read
+FOOTPRINT = 1.5  # voxels: a voxel is drawn at its surface's mean, anywhere inside it, and must not leave holes
 CONTRAST = (2, 98)  # percentiles that become the darkest and the brightest: strays would wash the rest out
 TILE_MAP_INCHES = (9.0, 9.0)
 TILE_MAP_DPI = 110
@@ -73,7 +74,7 @@ def prior_picture(window: "Window", x_m: Range, y_m: Range, voxel_m: float) -> R
         "features, first three channels": feature_image(_stretched(window.features[:, :3])),
         f"height, {low[0]:.1f} m (blue) to {high[0]:.1f} m (red)": _height_colours(window.points_ego[:, 2:]),
     }
-    drawn = [birds_eye(window.points_ego, colours, view, voxel_m) for colours in panels.values()]
+    drawn = [birds_eye(window.points_ego, colours, view, FOOTPRINT * voxel_m) for colours in panels.values()]
     return stack_rows([drawn], list(panels))
 
 
