@@ -1,4 +1,4 @@
-"""How a city looks: what makes two cities differ in more than their street plan."""
+"""How a city looks and how busy it is: what makes two cities differ in more than their street plan."""
 
 from dataclasses import dataclass
 
@@ -48,3 +48,13 @@ class CityStyle:
             asphalt=(grey, grey, grey * 1.04),
             foliage=(float(rng.uniform(0.10, 0.20)), float(rng.uniform(0.20, 0.28)), float(rng.uniform(0.05, 0.09))),
         )
+
+
+@dataclass(frozen=True)
+class Density:
+    """How busy the streets are."""
+
+    vehicles: int = 26  # driving
+    cyclists: int = 5
+    pedestrians: int = 34
+    parked: float = 0.42  # share of bays taken

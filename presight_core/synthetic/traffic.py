@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from presight_core.synthetic.actors import FIRST_ACTOR, KINDS, Actor
 from presight_core.synthetic.city import City
 from presight_core.synthetic.graph import follow
+from presight_core.synthetic.style import Density
 
 REACH_M = 130.0  # actors farther from the ego than this are not drawn
 CHECK_S = 0.25  # how often two tracks are compared
@@ -16,16 +17,6 @@ PAINTS = (
     (0.70, 0.70, 0.70), (0.04, 0.04, 0.05), (0.30, 0.31, 0.33), (0.45, 0.04, 0.04), (0.04, 0.10, 0.35),
     (0.55, 0.53, 0.48), (0.03, 0.20, 0.11), (0.62, 0.45, 0.05),
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Density:
-    """How busy the streets are."""
-
-    vehicles: int = 26  # driving
-    cyclists: int = 5
-    pedestrians: int = 34
-    parked: float = 0.42  # share of bays taken
 
 
 @dataclass(frozen=True)

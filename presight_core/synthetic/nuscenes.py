@@ -1,0 +1,275 @@
+"""The nuScenes v1.0 tables of synthetic drives: rows, tokens and files as the official schema has them."""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from presight_core.frames import quaternion_from_rotation
+from presight_core.synthetic.drive_plan import SWEEPS_A_KEYFRAME, DrivePlan, Shot
+from presight_core.synthetic.rig import RIG
+
+VERSION = "v1.0-mini"
+TABLES = (
+    "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample", "sample_annotation",
+    "sample_data", "scene", "sensor", "visibility",
+)  # fmt: skip
+CATEGORIES = (
+    "human.pedestrian.adult", "human.pedestrian.child", "human.pedestrian.wheelchair", "human.pedestrian.stroller",
+    "human.pedestrian.personal_mobility", "human.pedestrian.police_officer", "human.pedestrian.construction_worker",
+    "animal", "vehicle.car", "vehicle.motorcycle", "vehicle.bicycle", "vehicle.bus.bendy", "vehicle.bus.rigid",
+    "vehicle.truck", "vehicle.construction", "vehicle.emergency.ambulance", "vehicle.emergency.police",
+    "vehicle.trailer", "movable_object.barrier", "movable_object.trafficcone", "movable_object.pushable_pullable",
+    "movable_object.debris", "static_object.bicycle_rack",
+)  # fmt: skip
+ATTRIBUTES = (
+    "vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider",
+    "pedestrian.sitting_lying_down", "pedestrian.standing", "pedestrian.moving",
+)  # fmt: skip
+VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")  # share of the object that some camera sees, in percent
+
+Row = dict[str, Any]
+Rows = dict[str, list[Row]]
+
+
+@dataclass(frozen=True)
+class Box:
+    """One annotated object at one keyframe, world frame."""
+
+    instance: int
+    category: str
+    attribute: str
+    centre_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]  # width, length, height, as nuScenes orders them
+    yaw_rad: float
+    visible_share: float
+
+
+def token(*parts: object) -> str:
+    """A name of 32 hex digits that depends on nothing but its parts."""
+    text = "/".join(str(part) for part in parts)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def image_path(plan: DrivePlan, shot: Shot) -> str:
+    """Where an image goes, relative to the data root."""
+    folder = "samples" if shot.is_keyframe else "sweeps"
+    return f"{folder}/{shot.mount.channel}/{logfile(plan)}__{shot.mount.channel}__{shot.timestamp_us}.jpg"
+
+
+def truth_path(plan: DrivePlan, shot: Shot) -> str:
+    """Where a keyframe's ground truth goes, relative to the data root."""
+    return f"synth_gt/{plan.name}/{shot.timestamp_us}_{shot.mount.channel}.npz"
+
+
+def logfile(plan: DrivePlan) -> str:
+    """Name of the log that a drive is cut from."""
+    return f"synth-{plan.captured}-{plan.number:04d}"
+
+
+# ---- rows --------------------------------------------------------------------------------------------------------
+
+
+def vocabulary_rows() -> Rows:
+    """Tables that are the same for every data set."""
+    return {
+        "category": [{"token": token("category", c), "name": c, "description": ""} for c in CATEGORIES],
+        "attribute": [{"token": token("attribute", a), "name": a, "description": ""} for a in ATTRIBUTES],
+        "visibility": [
+            {"token": str(number), "level": level, "description": f"visibility of whole object: {level[1:]} %"}
+            for number, level in enumerate(VISIBILITY, 1)
+        ],
+        "sensor": [{"token": token("sensor", m.channel), "channel": m.channel, "modality": "camera"} for m in RIG],
+    }
+
+
+def map_row(location: str, logs: Sequence[Row]) -> Row:
+    """The row that ties logs to the picture of their map."""
+    name = token("map", location)
+    return {
+        "token": name,
+        "log_tokens": [row["token"] for row in logs],
+        "category": "semantic_prior",
+        "filename": f"maps/{name}.png",
+    }
+
+
+def drive_rows(
+    plan: DrivePlan, location: str, size_px: tuple[int, int], shots: Sequence[Shot], boxes: Mapping[int, Sequence[Box]]
+) -> Rows:
+    """Rows of one drive. `boxes` holds the annotations of each keyframe, by its number."""
+    rows: Rows = {
+        "log": [
+            {
+                "token": token(plan.name, "log"),
+                "logfile": logfile(plan),
+                "vehicle": "synth",
+                "date_captured": plan.captured,
+                "location": location,
+            }
+        ],
+        "scene": [_scene_row(plan)],
+        "sample": _sample_rows(plan),
+        "calibrated_sensor": _calibration_rows(plan, size_px),
+        "ego_pose": [_pose_row(plan, shot) for shot in shots],
+        "sample_data": _image_rows(plan, size_px, shots),
+    }
+    return rows | _annotation_rows(plan, boxes)
+
+
+def _sample_token(plan: DrivePlan, keyframe: int) -> str:
+    return token(plan.name, "sample", keyframe) if 0 <= keyframe < plan.keyframes else ""
+
+
+def _scene_row(plan: DrivePlan) -> Row:
+    return {
+        "token": token(plan.name),
+        "log_token": token(plan.name, "log"),
+        "nbr_samples": plan.keyframes,
+        "first_sample_token": _sample_token(plan, 0),
+        "last_sample_token": _sample_token(plan, plan.keyframes - 1),
+        "name": plan.name,
+        "description": f"Synthetic city, {plan.light}",
+    }
+
+
+def _sample_rows(plan: DrivePlan) -> list[Row]:
+    return [
+        {
+            "token": _sample_token(plan, keyframe),
+            "timestamp": plan.keyframe_us(keyframe),
+            "prev": _sample_token(plan, keyframe - 1),
+            "next": _sample_token(plan, keyframe + 1),
+            "scene_token": token(plan.name),
+        }
+        for keyframe in range(plan.keyframes)
+    ]
+
+
+def _calibration_rows(plan: DrivePlan, size_px: tuple[int, int]) -> list[Row]:
+    return [
+        {
+            "token": token(plan.name, "calibration", mount.channel),
+            "sensor_token": token("sensor", mount.channel),
+            "translation": list(mount.position_m),
+            "rotation": _quaternion(mount.ego_from_camera),
+            "camera_intrinsic": mount.intrinsics(*size_px).tolist(),
+        }
+        for mount in RIG
+    ]
+
+
+def _pose_row(plan: DrivePlan, shot: Shot) -> Row:
+    world_from_ego = plan.world_from_ego(shot.time_s)
+    return {
+        "token": token(image_path(plan, shot)),
+        "timestamp": shot.timestamp_us,
+        "rotation": _quaternion(world_from_ego),
+        "translation": world_from_ego[:3, 3].tolist(),
+    }
+
+
+def _image_rows(plan: DrivePlan, size_px: tuple[int, int], shots: Sequence[Shot]) -> list[Row]:
+    rows: list[Row] = []
+    latest: dict[str, Row] = {}
+    for shot in shots:
+        path = image_path(plan, shot)
+        following = -(-shot.moment // SWEEPS_A_KEYFRAME)  # a sweep belongs to the keyframe that comes next
+        previous = latest.get(shot.mount.channel)
+        row = {
+            "token": token(path),
+            "sample_token": _sample_token(plan, following),
+            "ego_pose_token": token(path),
+            "calibrated_sensor_token": token(plan.name, "calibration", shot.mount.channel),
+            "timestamp": shot.timestamp_us,
+            "fileformat": "jpg",
+            "is_key_frame": shot.is_keyframe,
+            "height": size_px[1],
+            "width": size_px[0],
+            "filename": path,
+            "prev": previous["token"] if previous else "",
+            "next": "",
+        }
+        if previous:
+            previous["next"] = row["token"]
+        latest[shot.mount.channel] = row
+        rows.append(row)
+    return rows
+
+
+def _annotation_rows(plan: DrivePlan, boxes: Mapping[int, Sequence[Box]]) -> Rows:
+    tracks: dict[int, list[tuple[int, Box]]] = {}
+    for keyframe in sorted(boxes):
+        for box in boxes[keyframe]:
+            tracks.setdefault(box.instance, []).append((keyframe, box))
+    instances, annotations = [], []
+    for instance, track in sorted(tracks.items()):
+        names = [token(plan.name, "annotation", instance, keyframe) for keyframe, _ in track]
+        instances.append(
+            {
+                "token": token(plan.name, "instance", instance),
+                "category_token": token("category", track[0][1].category),
+                "nbr_annotations": len(track),
+                "first_annotation_token": names[0],
+                "last_annotation_token": names[-1],
+            }
+        )
+        chain = ["", *names, ""]
+        for number, (keyframe, box) in enumerate(track):
+            annotations.append(_annotation_row(plan, keyframe, box, chain[number : number + 3]))
+    return {"instance": instances, "sample_annotation": annotations}
+
+
+def _annotation_row(plan: DrivePlan, keyframe: int, box: Box, chain: Sequence[str]) -> Row:
+    """One box; `chain` is the tokens of the previous annotation of this object, this one and the next."""
+    level = int(np.searchsorted([0.4, 0.6, 0.8], box.visible_share, side="right"))
+    return {
+        "token": chain[1],
+        "sample_token": _sample_token(plan, keyframe),
+        "instance_token": token(plan.name, "instance", box.instance),
+        "visibility_token": str(level + 1),
+        "attribute_tokens": [token("attribute", box.attribute)],
+        "translation": list(box.centre_m),
+        "size": list(box.size_m),
+        "rotation": [float(np.cos(box.yaw_rad / 2)), 0.0, 0.0, float(np.sin(box.yaw_rad / 2))],
+        "prev": chain[0],
+        "next": chain[2],
+        "num_lidar_pts": 0,
+        "num_radar_pts": 0,
+    }
+
+
+def _quaternion(a_from_b: NDArray[np.float64]) -> list[float]:
+    return quaternion_from_rotation(a_from_b[:3, :3]).tolist()
+
+
+# ---- files -------------------------------------------------------------------------------------------------------
+
+
+def merge(parts: Iterable[Rows]) -> Rows:
+    """All rows, table by table, in the given order."""
+    merged: Rows = {table: [] for table in TABLES}
+    for part in parts:
+        for table, rows in part.items():
+            merged[table] += rows
+    return merged
+
+
+def write_tables(folder: Path, rows: Rows) -> None:
+    """Write every table; `scene.json`, which readers look for first, comes last."""
+    for table in sorted(TABLES, key=lambda name: name == "scene"):
+        write_json(folder / f"{table}.json", rows[table])
+
+
+def write_json(path: Path, content: object) -> None:
+    """Replace a JSON file as a whole, so that nobody ever reads half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    unfinished.write_text(json.dumps(content, indent=0), encoding="utf-8")
+    unfinished.replace(path)
