@@ -135,8 +135,7 @@ def _build_tiles(jobs: dict[str, Job], broken: dict[str, str]) -> tuple[list[Bui
     trained = {tile_id: tasks.train_tile.submit(job) for tile_id, job in jobs.items() if tile_id not in failed}
     # Extractions queue behind all trainings, so that none holds a thread while it waits for its field.
     extracted = {
-        tile_id: tasks.extract_tile.submit(jobs[tile_id], wait_for=[future])
-        for tile_id, future in trained.items()
+        tile_id: tasks.extract_tile.submit(jobs[tile_id], wait_for=[future]) for tile_id, future in trained.items()
     }
     built = []
     for tile_id, future in trained.items():

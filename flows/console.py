@@ -7,6 +7,8 @@ from typing import Any
 
 from presight_core.progress import Progress, Report
 
+PIPED_WIDTH = 160  # columns where there is no terminal to ask: logs scroll sideways better than they wrap
+
 
 def print_json(value: Any) -> None:
     """One JSON document on standard output."""
@@ -24,7 +26,9 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[obje
         table.add_column(column, justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*(f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in row))
-    Console(soft_wrap=False).print(table)
+    console = Console()
+    console.width = console.width if console.is_terminal else max(console.width, PIPED_WIDTH)
+    console.print(table)
 
 
 @contextmanager

@@ -98,12 +98,8 @@ def _workspace(workspace: Workspace) -> Iterator[Finding]:
         return
     cities = catalog.cities()
     yield Finding("catalog", True, f"{workspace.catalog_url}: {len(cities)} cities ({', '.join(cities) or 'none'})")
-    yield Finding(
-        "store",
-        Path(workspace.store_location).exists() or "://" in workspace.store_location,
-        workspace.store_location,
-        "nothing built yet: presight build CITY",
-    )
+    built = "://" in workspace.store_location or Path(workspace.store_location).exists()
+    yield Finding("store", True, f"{workspace.store_location}{'' if built else ': nothing built yet'}")
 
 
 def show_findings(folder: Path, as_json: bool) -> None:

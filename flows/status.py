@@ -8,7 +8,7 @@ from presight_core.errors import NotFoundError
 from storage.catalog import Build
 from storage.workspace import Workspace
 
-COLUMNS = ("city", "tile", "state", "stage", "done", "voxels", "PSNR dB", "generation", "updated", "error")
+COLUMNS = ("city", "tile", "state", "stage", "done", "voxels", "PSNR dB", "generation", "updated (UTC)", "error")
 
 
 def show_status(folder: Path, city: str | None, as_json: bool) -> None:
@@ -23,10 +23,11 @@ def show_status(folder: Path, city: str | None, as_json: bool) -> None:
         print_json({name: [asdict(build) for build in builds[name]] for name in chosen})
         return
     rows = [_row(name, build) for name in chosen for build in builds[name]]
-    print_table(str(folder), COLUMNS, rows)
+    if rows:
+        print_table(str(folder), COLUMNS, rows)
     for name in chosen:
         if not builds[name]:
-            print(f"{name}: {len(catalog.drives(name))} drives, nothing built yet; next: presight build {name}")
+            print(f"{name}: ingested, nothing built yet; next: presight plan {name}")
 
 
 def _row(city: str, build: Build) -> tuple[object, ...]:
@@ -42,6 +43,6 @@ def _row(city: str, build: Build) -> tuple[object, ...]:
         f"{build.metrics['voxels']:,}" if "voxels" in build.metrics else "",
         f"{psnr:.1f}" if psnr is not None else "",
         build.metrics.get("generation", ""),
-        build.finished_at or build.started_at,
+        build.updated_at[:19].replace("T", " "),
         first_line,
     )
