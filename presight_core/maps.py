@@ -22,7 +22,8 @@ NORTH_RADIUS_PX = 9
 STEPS_M = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # lengths of a scale bar that people can read
 FOOTPRINT = 1.5  # voxels: a voxel is drawn at its surface's mean, anywhere inside it, and must not leave holes
 CONTRAST = (2, 98)  # percentiles that become the darkest and the brightest: strays would wash the rest out
-TILE_MAP_INCHES = (9.0, 9.0)
+TILE_MAP_INCHES = 9.0  # longer side
+SLIMMEST = 0.4  # shorter side of a tile map, of the longer one: a straight street still needs room for its labels
 TILE_MAP_DPI = 110
 TINT_CELLS = 400  # resolution of the coloured tile cells behind the positions
 MOST_POINTS = 50_000  # more camera positions than this draw slowly and show nothing new
@@ -85,7 +86,8 @@ def tile_map(positions_world: ArrayLike, tiling: Tiling, sub_fields: Sequence[Se
 
     positions = np.asarray(positions_world, np.float64)[:, :2]
     positions = positions[:: -(-len(positions) // MOST_POINTS)]
-    figure = Figure(TILE_MAP_INCHES, TILE_MAP_DPI, layout="constrained")
+    spans = np.maximum(np.ptp(np.concatenate([positions, tiling.centroids]), axis=0), 1.0)
+    figure = Figure(TILE_MAP_INCHES * np.maximum(spans / spans.max(), SLIMMEST), TILE_MAP_DPI, layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlabel="x, m east", ylabel="y, m north", title=tiling.city)
     _draw_boxes(axes, sub_fields)
     axes.scatter(*positions.T, s=3, c=_tile_colours(tiling.nearest(positions)), linewidths=0)
