@@ -23,7 +23,7 @@ PRAGMAS = (
     "PRAGMA foreign_keys = ON",
 )
 VERSION_TABLE = "alembic_version"
-MIGRATION_LOCK = 0x50524553  # "PRES": a number for PostgreSQL's advisory lock that nobody else takes
+WRITE_LOCK = 0x50524553  # "PRES": a number for PostgreSQL's advisory lock that nobody else takes
 
 
 class Query(Protocol):
@@ -150,8 +150,8 @@ class SqlalchemyDatabase:
         return self._transaction()
 
     def writing(self) -> AbstractContextManager[Query]:
-        """A transaction that writes."""
-        return self._transaction()
+        """A transaction that writes; one at a time, as in SQLite."""
+        return self._transaction(lock=True)
 
     def revision(self) -> str | None:
         """The schema's revision; None for an empty database."""
@@ -167,8 +167,10 @@ class SqlalchemyDatabase:
         return self._engine
 
     @contextmanager
-    def _transaction(self) -> Iterator[Query]:
+    def _transaction(self, lock: bool = False) -> Iterator[Query]:
         with self._connected() as connection:
+            if lock:
+                take_write_lock(connection)
             yield _SqlalchemyQuery(connection)
 
     @contextmanager
@@ -193,6 +195,14 @@ class _SqlalchemyQuery:
 
         result = self.connection.execute(text(sql), values)
         return [dict(row) for row in result.mappings()] if result.returns_rows else []
+
+
+def take_write_lock(connection: "Connection") -> None:
+    """Keep all other writers waiting until the transaction ends. SQLite has done so at its begin."""
+    from sqlalchemy import text
+
+    if connection.dialect.name == "postgresql":
+        connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": WRITE_LOCK})
 
 
 def _revision(query: Query) -> str | None:
@@ -232,9 +242,13 @@ def _take_lock_at_begin(engine: "Engine") -> None:
 
 
 def _conflict(name: str, error: object) -> ConflictError:
-    return ConflictError(f"{name}: somebody else wrote the same at the same time ({error}); run it again")
+    return ConflictError(f"{name}: somebody else changed it at the same time ({_first_line(error)}); run it again")
 
 
 def _unusable(name: str, error: object) -> StoreError:
-    fact = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-    return StoreError(f"{name}: the catalog cannot be used: {fact}; check that it is reachable, writable and undamaged")
+    cure = "check that it is reachable, writable and undamaged"
+    return StoreError(f"{name}: the catalog cannot be used: {_first_line(error)}; {cure}")
+
+
+def _first_line(error: object) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

@@ -5,10 +5,10 @@ from pathlib import Path
 from alembic import command
 from alembic.config import Config
 from alembic.util.exc import CommandError
-from sqlalchemy import exc, text
+from sqlalchemy import exc
 
 from presight_core.errors import StoreError
-from storage.database import MIGRATION_LOCK, Database
+from storage.database import Database, take_write_lock
 
 
 def upgrade(database: Database) -> None:
@@ -21,11 +21,12 @@ def upgrade(database: Database) -> None:
     engine = database.engine()
     try:
         with engine.begin() as connection:
-            if engine.dialect.name == "postgresql":
-                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": MIGRATION_LOCK})
+            take_write_lock(connection)
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
     except CommandError as error:
         raise StoreError(f"catalog: made by a newer version of presight ({error}); upgrade this program") from error
     except exc.SQLAlchemyError as error:
-        raise StoreError(f"catalog: its schema cannot be made: {error}; check the database's rights") from error
+        raise StoreError(
+            f"catalog: its schema cannot be made: {str(error).splitlines()[0]}; check the database's rights"
+        ) from error
