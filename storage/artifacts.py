@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import numpy as np
+
 from presight_core.errors import NotFoundError, StoreError
 from presight_core.feature_space import FeatureSpace
 from presight_core.recipes import digest_of
@@ -37,7 +39,9 @@ class Artifacts:
                 "explained": round(float(space.explained.sum()), 6),
             }
             with whole_folder(self._space(space.space_id)) as temporary:
-                save_file({name: getattr(space, name) for name in ARRAYS}, temporary / "space.safetensors")
+                # safetensors writes the memory as it lies, so that it must lie row by row
+                arrays = {name: np.ascontiguousarray(getattr(space, name)) for name in ARRAYS}
+                save_file(arrays, temporary / "space.safetensors")
                 (temporary / "space.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
         return space.space_id
 

@@ -30,6 +30,12 @@ def test_a_space_comes_back_bit_for_bit(artifacts, space):
         np.testing.assert_array_equal(getattr(read, field.name), getattr(space, field.name))
 
 
+def test_a_space_whose_numbers_lie_column_by_column_comes_back_too(artifacts, space):
+    turned = replace(space, components=np.asfortranarray(space.components))
+    read = artifacts.space(artifacts.save_space(turned))
+    np.testing.assert_array_equal(read.components, space.components)
+
+
 def test_saving_again_changes_nothing(artifacts, space):
     assert artifacts.save_space(space) == artifacts.save_space(space) == space.space_id
     assert artifacts.has_space(space.space_id)
