@@ -12,6 +12,7 @@ from presight_core import errors
 from presight_core.errors import BuildError, PresightError
 from presight_core.progress import Progress, Report, silent
 
+WORKER = (sys.executable, "-m", "flows.worker")
 KEPT_LINES = 12  # of a crashed worker's output: a traceback's end
 
 
@@ -21,31 +22,29 @@ class WorkerLostError(BuildError):
 
 def run_job(command: str, job: Job, report: Report = silent) -> dict[str, Any]:
     """The result of a worker command. Raises the PresightError it raised, or WorkerLostError if it died."""
-    arguments = [sys.executable, "-m", "flows.worker", command, job.to_json()]
-    process = subprocess.Popen(
-        arguments,
+    last_lines: deque[str] = deque(maxlen=KEPT_LINES)
+    outcome: dict[str, Any] = {}
+    with subprocess.Popen(
+        [*WORKER, command, job.to_json()],
         stdin=subprocess.PIPE,  # stays open while we live: the worker ends when it closes
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         env=worker_environment(job.threads),
-    )
-    assert process.stdout is not None
-    last_lines: deque[str] = deque(maxlen=KEPT_LINES)
-    outcome: dict[str, Any] = {}
-    try:
-        for line in process.stdout:
-            message = _message(line)
-            if message is None:
-                last_lines.append(line.rstrip())
-            elif "progress" in message:
-                report(Progress(**message["progress"]))
-            else:
-                outcome = message
-    finally:
-        if process.poll() is None and not outcome:
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                message = _message(line)
+                if message is None:
+                    last_lines.append(line.rstrip())
+                elif "progress" in message:
+                    report(Progress(**message["progress"]))
+                else:
+                    outcome = message
+        except BaseException:
             process.terminate()
-        process.wait()
+            raise
     if "error" in outcome:
         raise _error(**outcome["error"])
     if "result" not in outcome:

@@ -6,6 +6,7 @@ It ends when its standard input closes, so that no worker outlives a killed buil
 
 import json
 import os
+import shutil
 import sys
 import threading
 import time
@@ -83,6 +84,7 @@ def extract(job: Job) -> dict[str, Any]:
     name = TileName(job.tile_id, f"{recipe_from(job.recipe).digest}-{uuid.uuid4().hex[:8]}")
     attributes = {"recipe": job.recipe, "space_id": job.space_id}
     entry = store.write_tile(job.city, name, voxels.batches, voxels.drives, attributes)
+    shutil.rmtree(job.scratch / "extraction")
     return {"entry": entry.to_json(), "counts": voxels.counts, "seconds": _since(started)}
 
 
