@@ -258,7 +258,8 @@ def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.
 
 def _chunk_runs(rows: NDArray[np.int64], chunk: int) -> Iterator[tuple[int, int]]:
     """First row and end row of each run of neighbouring chunks that hold any of the ascending rows."""
-    chunks = np.unique(rows // chunk)
+    chunks = rows // chunk
+    chunks = chunks[np.flatnonzero(np.diff(chunks, prepend=-1))]
     for run in np.split(chunks, np.flatnonzero(np.diff(chunks) > 1) + 1):
         if len(run):
             yield int(run[0]) * chunk, (int(run[-1]) + 1) * chunk

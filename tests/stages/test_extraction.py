@@ -8,18 +8,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from presight_core import classes
+from presight_core import classes, frames
 from presight_core.cameras import Camera, pixel_centres
 from presight_core.config import CitySettings
 from presight_core.drives import FrameTable
 from presight_core.errors import InputError
 from presight_core.grid import Lattice, morton
 from presight_core.pixels import FramePixels
+from presight_core.priors import PriorReader
+from presight_core.priors.documents import GenerationTile
 from presight_core.priors.schema import array_specs, check_batch, unpack_columns, unpack_voxels
 from presight_core.progress import Progress
 from presight_core.tiles import Tile, Tiling
 from stages import extraction
 from stages.extraction import CameraHeights, TileExtraction, chosen_rows, extract_tile
+from storage.priors import PriorStore
+from storage.tile_groups import TileName
 
 WIDTH, HEIGHT = 60, 40
 GROUND_M, WALL_M, ROOF_M = 0.1, 6.1, 5.0  # ground height; the wall's y, and its top
@@ -103,8 +107,8 @@ def street_field(monkeypatch):
     monkeypatch.setattr(extraction, "find_surface", street_surface)
 
 
-def job_of(frames: FrameTable, tiling: Tiling = ONE_TILE, tile: int = 0, city: CitySettings = CITY) -> TileExtraction:
-    return TileExtraction(tile, tiling, Lattice(), frames, city, CHANNELS)
+def job_of(table: FrameTable, tiling: Tiling = ONE_TILE, tile: int = 0, city: CitySettings = CITY) -> TileExtraction:
+    return TileExtraction(tile, tiling, Lattice(), table, city, CHANNELS)
 
 
 def extracted(job: TileExtraction, scratch: Path):
@@ -263,6 +267,19 @@ def test_extraction_of_the_same_frames_is_the_same(tmp_path: Path):
         np.testing.assert_array_equal(one.hits, other.hits)
 
 
+def test_what_was_extracted_is_read_back_around_the_vehicle(tmp_path: Path):
+    result = extract_tile(job_of(street_frames()), None, StreetPixels(), tmp_path)  # type: ignore[arg-type]
+    store = PriorStore.open(tmp_path / "store")
+    store.create_city("town", Lattice(), "space", CHANNELS)
+    entry = store.write_tile("town", TileName("t000", "build"), result.batches, result.drives, {})
+    store.publish("town", {"t000": GenerationTile(entry, {})}, None, ONE_TILE.to_json())
+    window = PriorReader.open(tmp_path / "store", "town").window(frames.planar_transform(4.0, 0.0, np.pi))
+    assert len(window) == result.counts["voxels"] == entry.voxel_count
+    distances = np.minimum(abs(window.points_world[:, 2] - GROUND_M), abs(window.points_world[:, 1] - WALL_M))
+    assert distances.max() < 0.4 / 256  # the step of a stored centroid
+    np.testing.assert_allclose(window.points_ego[:, 0], 4.0 - window.points_world[:, 0], atol=1e-5)
+
+
 def test_progress_reaches_its_total(tmp_path: Path):
     seen: list[Progress] = []
     extract_tile(job_of(street_frames()), None, StreetPixels(), tmp_path, seen.append)  # type: ignore[arg-type]
@@ -282,10 +299,10 @@ def test_a_field_of_another_feature_space_is_an_input_error(tmp_path: Path):
 
 
 def test_every_second_training_frame_of_a_camera_is_chosen_and_no_held_out_one():
-    frames = street_frames(count=9, drives=("a", "b"))
+    table = street_frames(count=9, drives=("a", "b"))
     city = CITY.model_copy(update={"training": CITY.training.model_copy(update={"holdout_every": 4})})
     # Of nine frames, 2 and 6 are held out; of the others, every second is taken.
-    assert sorted(chosen_rows(job_of(frames, city=city))) == [0, 3, 5, 8, 9, 12, 14, 17]
+    assert sorted(chosen_rows(job_of(table, city=city))) == [0, 3, 5, 8, 9, 12, 14, 17]
 
 
 def test_heights_follow_a_hill():
