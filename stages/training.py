@@ -79,7 +79,7 @@ def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Re
     rows = training_rows(job.frames, job.settings.training)
     if not len(rows):
         raise InputError(f"tile {job.tile_id}: none of its {len(job.frames)} frames is for training; ingest more")
-    run = _Run(job, scratch)
+    run = Run(job, scratch)
     pools = _Pools(job, source, rows)
     log = _Log(job, scratch, report)
     settings = job.settings.training
@@ -174,7 +174,7 @@ class _Pools:
         return np.sort(order[np.argsort(rank, kind="stable")[: self._capacity]])
 
 
-class _Run:
+class Run:
     """A field in training: its parameters, its optimiser, and their checkpoint."""
 
     def __init__(self, job: TileTraining, scratch: Path) -> None:

@@ -17,7 +17,8 @@ def feature_loss(rendered: Tensor, target: Tensor) -> Tensor:
 def sky_loss(accumulation: Float[Tensor, " rays"], is_sky: Bool[Tensor, " rays"]) -> Tensor:
     """Binary cross-entropy: rays of the sky should end nowhere, all others somewhere."""
     # The bound of half a float32 step below 1 keeps both logarithms finite.
-    return functional.binary_cross_entropy(accumulation.clamp(1e-7, 1 - 1e-7), (~is_sky).to(accumulation))
+    bounded = accumulation.clamp(1e-7, 1 - 1e-7)
+    return -torch.where(is_sky, 1 - bounded, bounded).log().mean()
 
 
 def distortion_loss(edges: Edges, weights: Weights) -> Tensor:
@@ -86,9 +87,9 @@ def blurred_cumulative(edges: Edges, weights: Weights, at: Edges, half_width: fl
 
 
 def _outer_bound(edges: Edges, proposal_edges: Edges, proposal_weights: Weights) -> Weights:
-    """Weight of all proposal bins that touch each bin of `edges`."""
+    """Weight of all proposal bins that meet each bin of `edges`, be it at an upper edge only."""
     reached = functional.pad(proposal_weights.cumsum(-1), (1, 0))
     last = proposal_edges.shape[-1] - 1
     low = (torch.searchsorted(proposal_edges, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, last - 1)
-    high = torch.searchsorted(proposal_edges, edges[:, 1:].contiguous()).clamp(0, last)
+    high = torch.searchsorted(proposal_edges, edges[:, 1:].contiguous(), right=True).clamp(1, last)
     return reached.gather(-1, high) - reached.gather(-1, low)

@@ -241,11 +241,11 @@ class TileField(nn.Module):
         seen = torch.cat([geometry_values, assignment.sort(of_rays)], -1)
         rgb = torch.sigmoid(self.colour(seen, assignment.bounds).float())
         features = self.semantics(torch.relu(hidden), assignment.bounds)
-        shape = ray_count, sample_count, -1
+        shape = ray_count, sample_count
         return PointValues(
-            assignment.restore(self._activate(density[:, 0], inside)).view(ray_count, sample_count),
-            assignment.restore(rgb).view(shape),
-            assignment.restore(features).float().view(shape),
+            assignment.restore(self._activate(density[:, 0], inside)).view(shape),
+            assignment.restore(rgb).unflatten(0, shape),
+            assignment.restore(features).float().unflatten(0, shape),
         )
 
     def density(self, points: Float[Tensor, "rays samples 3"]) -> Float[Tensor, "rays samples"]:

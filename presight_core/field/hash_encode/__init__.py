@@ -32,7 +32,7 @@ def hash_encode(points: Tensor, segments: Tensor, table: Tensor, offsets: Tensor
 @torch.library.custom_op("presight::hash_encode_table_gradient", mutates_args=(), device_types="cpu")
 def table_gradient(points: Tensor, segments: Tensor, gradient: Tensor, offsets: Tensor, levels: Tensor) -> Tensor:
     """Gradient (rows, features) of the table; `gradient` is that of the output."""
-    result = gradient.new_zeros(int(offsets[-1, -1] + levels[-1, 1]), gradient.shape[1] // len(levels))
+    result = gradient.new_empty(int(offsets[-1, -1] + levels[-1, 1]), gradient.shape[1] // len(levels))
     _run(numba_kernels.table_gradient, points, segments, gradient, offsets, levels, result)
     return result
 

@@ -51,9 +51,10 @@ def encode(points, segments, table, offsets, levels, output, worker_count):  # n
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def table_gradient(points, segments, gradient, offsets, levels, result, worker_count):  # noqa: PLR0913, PLR0917 - likewise
-    """Add to result (rows, features). An item of work is a level of a sub-field, which owns its rows.
+    """Fill result (rows, features). An item of work is a level of a sub-field, which owns its rows.
 
-    So there are no atomics and no copies, and the sum is the same whatever the number of threads.
+    So there are no atomics and no copies, and the sum is the same whatever the number of threads. A level
+    is zeroed just before it is added to, while it is in the cache.
     """
     features = result.shape[1]
     flat_result, flat_gradient = result.reshape(-1), gradient.reshape(-1)
@@ -66,6 +67,7 @@ def table_gradient(points, segments, gradient, offsets, levels, result, worker_c
             sub_field, level = item // level_count, item % level_count
             start = offsets[sub_field, level] * features
             level_table = flat_result[start : start + levels[level, 1] * features]
+            level_table[:] = 0
             column = level * features
             last = segments[sub_field + 1]
             for low in range(segments[sub_field], last, BLOCK):

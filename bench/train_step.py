@@ -1,0 +1,127 @@
+"""How fast a whole training step is: `python bench/train_step.py [--preset fast] [--threads 1]`.
+
+Random rays along a made-up street; the shape (batch, samples, tables, networks) is that of the preset.
+Prints a table, and writes it as JSON to bench/out/train_step.json.
+"""
+
+import argparse
+import json
+import statistics
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from presight_core import classes
+from presight_core.config import load_city_settings
+from presight_core.drives import FrameTable
+from presight_core.field import threads
+from presight_core.frames import planar_transform
+from stages.ray_pool import PixelBatch
+from stages.tiling import sub_fields
+from stages.training import Run, TileTraining
+
+STREET_M = 200.0
+FRAMES = 64
+CHANNELS = 32
+WARM_UP = 3  # steps: kernels load and memory grows
+
+
+@dataclass
+class Stopwatch:
+    """Wall and processor seconds of steps."""
+
+    wall: list[float] = field(default_factory=list)
+    processor: list[float] = field(default_factory=list)
+
+    def time(self, call) -> None:
+        """Run and note one call."""
+        wall, processor = time.perf_counter(), time.process_time()
+        call()
+        self.wall.append(time.perf_counter() - wall)
+        self.processor.append(time.process_time() - processor)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--set", action="append", default=[], help="a setting, section.name=value")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "out" / "train_step.json")
+    options = parser.parse_args()
+    settings = load_city_settings(None, [f"preset={options.preset}", *options.set])
+    threads.use_threads(options.threads)
+    threads.keep_freed_memory()
+    frames = street()
+    job = TileTraining("bench", frames, sub_fields(frames.positions, settings.tiling), settings, CHANNELS)
+    with tempfile.TemporaryDirectory() as scratch:
+        result = measure(Run(job, Path(scratch)), job, options.steps)
+    result |= {"preset": options.preset, "threads": options.threads, "batch_rays": settings.training.batch_rays}
+    for name, value in result.items():
+        print(f"{name:24} {value if isinstance(value, str | int) else f'{value:,.1f}'}")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+
+
+def measure(run: Run, job: TileTraining, steps: int) -> dict[str, float | int | str]:
+    """Medians of whole steps: milliseconds of wall and processor time, and rays a second of each."""
+    watch = Stopwatch()
+    first = job.settings.training.steps // 2  # past the warm-up, where the proposals learn every fifth step
+    for step in range(first, first + WARM_UP + steps):
+        batch = random_batch(job, step)
+        watch.time(lambda step=step, batch=batch: run.train(step, batch))
+    rays = job.settings.training.batch_rays
+    means = {
+        name: statistics.fmean(sorted(values[WARM_UP:])[: -max(1, steps // 10)])
+        for name, values in (("wall", watch.wall), ("processor", watch.processor))
+    }
+    return {
+        "step_wall_ms": means["wall"] * 1000,
+        "step_processor_ms": means["processor"] * 1000,
+        "rays_per_s": rays / means["wall"],
+        "rays_per_processor_s": rays / means["processor"],
+        "parameters": sum(parameter.numel() for parameter in run.field.parameters()),
+    }
+
+
+def street() -> FrameTable:
+    """Cameras along a straight street, looking ahead."""
+    poses = np.stack([planar_transform(x, 0, 0) for x in np.linspace(0, STREET_M, FRAMES)])
+    ego_from_camera = np.array([[0, 0, 1, 1.5], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]])
+    intrinsics = np.array([[250.0, 0, 200], [0, 250, 112.5], [0, 0, 1]])
+    return FrameTable(
+        drive_id=np.full(FRAMES, "drive"),
+        camera=np.full(FRAMES, "CAM_FRONT"),
+        timestamp_us=np.arange(FRAMES) * 500_000,
+        path=np.array([f"{i}.jpg" for i in range(FRAMES)]),
+        file_bytes=np.zeros(FRAMES, np.int64),
+        width_px=np.full(FRAMES, 400, np.int32),
+        height_px=np.full(FRAMES, 225, np.int32),
+        intrinsics=np.tile(intrinsics, (FRAMES, 1, 1)),
+        world_from_camera=poses @ ego_from_camera,
+        is_keyframe=np.ones(FRAMES, np.bool_),
+    )
+
+
+def random_batch(job: TileTraining, seed: int) -> PixelBatch:
+    """Rays of random frames in all directions near the horizon, with random targets."""
+    random = np.random.default_rng(seed)
+    count = job.settings.training.batch_rays
+    rows = random.integers(len(job.frames), size=count)
+    directions = random.normal(size=(count, 3)) * (1, 1, 0.2)
+    return PixelBatch(
+        rows,
+        job.frames.positions[rows],
+        directions / np.linalg.norm(directions, axis=-1, keepdims=True),
+        random.integers(256, size=(count, 3)).astype(np.uint8),
+        random.integers(classes.SKY + 1, size=count).astype(np.uint8),
+        random.integers(256, size=(count, CHANNELS)).astype(np.uint8),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+import pytest
+import torch
+
+from presight_core.config import TrainingSettings
+from presight_core.field import losses, rendering, samplers, schedule
+from presight_core.field.assignment import assign
+from presight_core.field.contraction import contract, grid_position
+from presight_core.field.mlp import SubFieldMlp
+from presight_core.field.spherical_harmonics import spherical_harmonics
+
+
+def test_contraction_leaves_the_unit_cube_alone():
+    points = torch.rand(100, 3) * 2 - 1
+    assert torch.equal(contract(points), points)
+
+
+def test_contraction_keeps_all_of_space_within_two():
+    assert contract(torch.randn(100, 3) * 1e6).abs().max() <= 2
+
+
+def test_contraction_has_a_gradient_at_the_origin():
+    origin = torch.zeros(1, 3, requires_grad=True)
+    contract(origin).sum().backward()
+    assert torch.equal(origin.grad, torch.ones(1, 3))
+
+
+def test_a_point_too_far_to_tell_apart_is_not_on_the_grid():
+    points = torch.tensor([[0.0, 0, 0], [1e12, 0, 0]])
+    position, inside = grid_position(points, torch.zeros(3), torch.ones(3))
+    assert inside.tolist() == [True, False]
+    assert position[1].tolist() == [0, 0, 0]
+
+
+def test_spherical_harmonics_are_orthonormal():
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(
+        torch.randn(200_000, 3, generator=generator, dtype=torch.float64), dim=-1
+    )
+    basis = spherical_harmonics(directions)
+    gram = basis.T @ basis / len(directions) * 4 * torch.pi
+    torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.03, rtol=0)  # sampling error
+
+
+def test_spacing_and_metres_are_inverses():
+    metres = torch.tensor([0.5, 50.0, 99.0, 101.0, 900.0], dtype=torch.float64)
+    torch.testing.assert_close(samplers.metres_from_spacing(samplers.spacing_from_metres(metres, 100), 100), metres)
+
+
+def test_s_runs_from_the_near_to_the_far_plane():
+    ends = samplers.Spacing(1.0, 500.0, 100.0).metres(torch.tensor([0.0, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(ends, torch.tensor([1.0, 500.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.5, 0.999])
+def test_jittered_edges_ascend_within_zero_and_one(jitter):
+    edges = samplers.uniform_edges(2, 8, torch.full((2, 1), jitter), torch.zeros(()))
+    assert bool((edges.diff(dim=-1) > 0).all())
+    assert edges.min() >= 0
+    assert edges.max() <= 1
+
+
+def test_resampling_puts_samples_where_the_weight_is():
+    edges = torch.linspace(0, 1, 11)[None]
+    weights = torch.zeros(1, 10)
+    weights[0, 3] = 1
+    new = samplers.resample(edges, weights, 16, None, padding=0.0)
+    assert bool(((new >= 0.3 - 1e-6) & (new <= 0.4 + 1e-6)).all())
+
+
+def test_resampling_an_empty_ray_is_uniform():
+    new = samplers.resample(torch.linspace(0, 1, 11)[None], torch.zeros(1, 10), 9, None, padding=0.0)
+    torch.testing.assert_close(new[0], torch.linspace(0.05, 0.95, 10))
+
+
+def test_weights_and_what_is_left_make_one():
+    density, lengths = torch.rand(5, 20) * 3, torch.rand(5, 20)
+    left = torch.exp(-(density * lengths).sum(-1))
+    torch.testing.assert_close(rendering.ray_weights(density, lengths).sum(-1) + left, torch.ones(5))
+
+
+def test_first_hit_lies_where_half_of_the_weight_is_reached():
+    weights = torch.tensor([[0.0, 0.25, 0.5, 0.25], [0.1, 0.1, 0.1, 0.1]])
+    depth, found = rendering.first_hit_depth(weights, torch.tensor([[0.0, 1, 2, 4, 5]]).expand(2, -1))
+    assert found.tolist() == [True, False]
+    assert depth[0] == 3.0  # a quarter before the third sample, which spans 2..4: halfway through it
+
+
+def test_truncated_exponential_has_a_bounded_gradient():
+    x = torch.tensor([1.0, 30.0], requires_grad=True)
+    rendering.truncated_exponential(x).sum().backward()
+    torch.testing.assert_close(x.grad, torch.tensor([1.0, 15.0]).exp())
+
+
+def random_histogram(bins: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    edges = torch.rand(6, bins + 1, generator=generator, dtype=torch.float64).sort(-1).values
+    weights = torch.rand(6, bins, generator=generator, dtype=torch.float64)
+    return edges, weights / weights.sum(-1, keepdim=True)
+
+
+def test_distortion_equals_the_sum_over_all_pairs():
+    edges, weights = random_histogram(9, 0)
+    middles = (edges[:, 1:] + edges[:, :-1]) / 2
+    pairs = weights[:, :, None] * weights[:, None] * (middles[:, :, None] - middles[:, None]).abs()
+    expected = pairs.sum((1, 2)) + (weights**2 * edges.diff(dim=-1)).sum(-1) / 3
+    torch.testing.assert_close(losses.distortion(edges, weights), expected)
+
+
+def test_a_proposal_equal_to_the_field_has_no_interlevel_loss():
+    edges, weights = random_histogram(9, 1)
+    assert losses.interlevel_loss(edges, weights, edges, weights) < 1e-12
+
+
+def test_interlevel_losses_teach_the_proposal_only():
+    (edges, weights), (proposal_edges, proposal) = random_histogram(9, 2), random_histogram(7, 3)
+    weights.requires_grad_()
+    proposal.requires_grad_()
+    loss = losses.blurred_interlevel_loss(edges, weights, proposal_edges, proposal, 0.03)
+    (loss + losses.interlevel_loss(edges, weights, proposal_edges, proposal)).backward()
+    assert weights.grad is None
+    assert proposal.grad.abs().max() > 0
+
+
+def test_a_narrow_blur_changes_a_cumulative_sum_little():
+    edges, weights = random_histogram(9, 4)
+    plain = torch.nn.functional.pad(weights.cumsum(-1), (1, 0))
+    blurred = losses.blurred_cumulative(edges, weights, edges, 1e-6)
+    torch.testing.assert_close(blurred, plain, atol=1e-3, rtol=0)
+
+
+def test_sky_loss_is_small_when_only_the_sky_is_empty():
+    is_sky = torch.tensor([True, False])
+    right, wrong = torch.tensor([0.01, 0.99]), torch.tensor([0.99, 0.01])
+    assert losses.sky_loss(right, is_sky) < 0.02 < losses.sky_loss(wrong, is_sky)
+
+
+def test_learning_rate_rises_then_drops():
+    settings = TrainingSettings(steps=100, learning_rate=1.0, warmup=0.1, decay_at=(0.5,), decay=0.33)
+    rates = [schedule.learning_rate(step, settings) for step in (0, 10, 49, 50)]
+    assert rates == pytest.approx([0.01, 1.0, 1.0, 0.33])
+
+
+def test_annealing_ends_at_one():
+    settings = TrainingSettings(steps=100, anneal=0.1)
+    exponents = [schedule.anneal_exponent(step, settings) for step in range(20)]
+    assert exponents[0] == 0
+    assert exponents == sorted(exponents)
+    assert exponents[-1] == 1
+
+
+def test_points_go_to_the_nearest_centroid_and_back_in_order():
+    centroids = torch.tensor([[0.0, 0, 0], [10, 0, 0], [0, 10, 0]])
+    points = torch.tensor([[9.0, 1, 0], [1, 0, 0], [0, 8, 1], [1, 1, 1], [11, 0, 0]])
+    assignment = assign(points, centroids)
+    assert assignment.bounds == [0, 2, 4, 5]
+    assert torch.equal(assignment.restore(assignment.sort(points)), points)
+
+
+def test_restoring_passes_gradients_to_the_right_rows():
+    points = torch.tensor([[10.0, 0, 0], [0, 0, 0]])
+    assignment = assign(points, torch.tensor([[0.0, 0, 0], [10, 0, 0]]))
+    values = torch.tensor([1.0, 2.0], requires_grad=True)
+    (assignment.restore(values) * torch.tensor([5.0, 7.0])).sum().backward()
+    assert values.grad.tolist() == [7, 5]
+
+
+def test_each_sub_field_has_its_own_network():
+    network = SubFieldMlp(2, (3, 4, 2))
+    inputs = torch.ones(5, 3)
+    outputs = network(inputs, [0, 2, 5])
+    assert torch.equal(outputs[0], outputs[1])
+    assert torch.equal(outputs[2], outputs[4])
+    assert not torch.equal(outputs[0], outputs[2])

@@ -1,0 +1,172 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from presight_core.config import FieldSettings, GridSettings, SamplingSettings
+from presight_core.errors import InputError, NotFoundError
+from presight_core.field.checkpoint import FIELD_FILE, load_field, save_field
+from presight_core.field.surface import find_surface
+from presight_core.field.tile_field import FieldShape, Sampling, TileField
+from presight_core.tiles import SubField
+
+EAST_M = 600_000.0  # far from the world's origin, as map coordinates may be
+
+
+def small_shape(sub_field_count: int = 2, channels: int = 5) -> FieldShape:
+    """Boxes in a row along x, each 20 m wide, with tiny grids."""
+    sub_fields = tuple(
+        SubField((EAST_M + 20 * i, 0, 0), (EAST_M + 20 * i - 10, -10, -10), (EAST_M + 20 * i + 10, 10, 10))
+        for i in range(sub_field_count)
+    )
+    grid = GridSettings(levels=3, features_per_level=4, min_resolution=4, max_resolution=16, log2_rows=8)
+    proposal = GridSettings(levels=2, features_per_level=1, min_resolution=4, max_resolution=8, log2_rows=8)
+    settings = FieldSettings(grid=grid, proposals=(proposal, proposal), hidden_width=8, proposal_width=4)
+    sampling = SamplingSettings(near_m=0.5, far_m=200, linear_m=20, proposal_samples=(64, 32), field_samples=32)
+    return FieldShape(sub_fields, settings, sampling, channels, video_count=3, image_count=4)
+
+
+def small_field(**options) -> TileField:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return TileField(small_shape(**options))
+
+
+def random_rays(count: int) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(0)
+    directions = random.normal(size=(count, 3))
+    origins = random.uniform(-8, 28, (count, 3)) * (1, 0.2, 0.2) + (EAST_M, 0, 0)
+    return origins, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+class Wall(TileField):
+    """A field whose density is a thick wall at x = EAST_M + 8 m and beyond."""
+
+    def _density(self, network, points):
+        return torch.where(points[..., 0] + self.origin_m[0] > EAST_M + 8, 50.0, 0.0)
+
+
+def test_rendering_has_a_row_for_each_ray():
+    field = small_field()
+    seen = field(field.rays(*random_rays(7)))
+    assert seen.rgb.shape == (7, 3)
+    assert seen.features.shape == (7, 5)
+    assert [tuple(proposal.weights.shape) for proposal in seen.proposals] == [(7, 64), (7, 32)]
+    assert bool((seen.accumulation <= 1 + 1e-6).all())
+
+
+def test_a_ray_does_not_depend_on_its_neighbours():
+    field = small_field()
+    origins, directions = random_rays(9)
+    together = field(field.rays(origins, directions))
+    alone = field(field.rays(origins[4:5], directions[4:5]))
+    torch.testing.assert_close(alone.rgb[0], together.rgb[4], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(alone.features[0], together.features[4], atol=1e-5, rtol=1e-5)
+
+
+def test_samples_are_answered_by_the_sub_field_they_are_nearest_to():
+    field = small_field()
+    point = field.rays(np.array([[EAST_M + 21, 1, 1]]), np.array([[1.0, 0, 0]])).origins[:, None]
+    before = field.density(point).item()
+    with torch.no_grad():
+        for bias in field.trunk.network.biases:
+            bias[0] += 1
+    assert field.density(point).item() == before
+    with torch.no_grad():
+        field.trunk.network.biases[-1][1] += 1
+    assert field.density(point).item() == pytest.approx(before * np.e)
+
+
+def test_every_parameter_learns():
+    field = small_field()
+    origins, directions = random_rays(64)
+    numbers = np.arange(64)
+    rays = field.rays(origins, directions, numbers % 3, numbers % 4)
+    seen = field(rays, Sampling(torch.Generator().manual_seed(0), 1.0, train_proposals=True))
+    loss = seen.rgb.sum() + seen.features.sum() + sum(proposal.weights.square().sum() for proposal in seen.proposals)
+    loss.backward()
+    idle = [name for name, parameter in field.named_parameters() if parameter.grad is None or not parameter.grad.any()]
+    assert idle == []
+
+
+def test_sky_features_ignore_the_video():
+    field = small_field()
+    origins, directions = random_rays(5)
+    views = []
+    for video in (0, 2):
+        rays = field.rays(origins, directions, np.full(5, video))
+        views.append(field._sky(rays, field.conditions(rays)))
+    assert not torch.equal(views[0][0], views[1][0])
+    assert torch.equal(views[0][1], views[1][1])
+
+
+def test_without_a_video_the_mean_embedding_is_used():
+    field = small_field()
+    origins, directions = random_rays(2)
+    unknown = field.conditions(field.rays(origins, directions))
+    known = [field.conditions(field.rays(origins, directions, np.full(2, video))) for video in range(3)]
+    torch.testing.assert_close(unknown, torch.stack(known).mean(0))
+
+
+def test_evaluation_is_repeatable_and_training_is_jittered():
+    field = small_field()
+    rays = field.rays(*random_rays(3))
+    assert torch.equal(field(rays).edges_m, field(rays).edges_m)
+    assert not torch.equal(field(rays).edges_m, field(rays, Sampling(torch.Generator())).edges_m)
+
+
+def test_a_saved_field_renders_the_same(tmp_path):
+    field = small_field()
+    save_field(tmp_path / "field", field)
+    again = load_field(tmp_path / "field")
+    rays = random_rays(5)
+    assert again.shape == field.shape
+    assert torch.equal(again(again.rays(*rays)).rgb, field(field.rays(*rays)).rgb)
+    assert json.loads((tmp_path / "field" / "field.json").read_text())["shape"]["feature_channels"] == 5
+
+
+def test_a_missing_field_says_what_to_do(tmp_path):
+    with pytest.raises(NotFoundError, match="train the tile first"):
+        load_field(tmp_path)
+
+
+def test_a_truncated_field_is_refused(tmp_path):
+    save_field(tmp_path, small_field())
+    file = tmp_path / FIELD_FILE
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(InputError, match="damaged"):
+        load_field(tmp_path)
+
+
+@pytest.mark.parametrize("surface", ["first-hit", "expected"])
+def test_surface_lies_on_the_wall(surface):
+    wall = Wall(small_shape())
+    origin = np.array([[EAST_M + 1, 0.2, 0.1], [EAST_M + 1, 0.2, 0.1]])
+    seen = find_surface(wall, origin, np.array([[1.0, 0, 0], [-1.0, 0, 0]]), surface)
+    assert seen.found.tolist() == [True, False]
+    assert seen.depth_m[0] == pytest.approx(7, abs=0.25)  # the wall begins inside a sample
+    np.testing.assert_allclose(seen.points_world[0], origin[0] + [seen.depth_m[0], 0, 0], atol=1e-6)
+
+
+def test_surface_density_is_the_mean_of_the_three_networks():
+    field, (origins, directions) = small_field(), random_rays(6)
+    seen = find_surface(field, origins, directions, "first-hit")
+    points = field.rays(seen.points_world, directions).origins[:, None]
+    networks = [field.density(points), *field.proposal_densities(points)]
+    np.testing.assert_allclose(seen.density, torch.stack(networks).mean(0)[:, 0].detach(), rtol=1e-3)
+
+
+def test_surface_points_do_not_depend_on_the_chunk(monkeypatch):
+    field, rays = small_field(), random_rays(20)
+    whole = find_surface(field, *rays, "first-hit")
+    monkeypatch.setattr("presight_core.field.surface.CHUNK_RAYS", 6)
+    parts = find_surface(field, *rays, "first-hit")
+    np.testing.assert_allclose(parts.points_world, whole.points_world, atol=1e-4)
+    np.testing.assert_array_equal(parts.found, whole.found)
+
+
+def test_no_rays_have_no_surface():
+    seen = find_surface(small_field(), np.zeros((0, 3)), np.zeros((0, 3)), "first-hit")
+    assert seen.features.shape == (0, 5)
+    assert seen.points_world.shape == (0, 3)
