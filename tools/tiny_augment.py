@@ -1,0 +1,64 @@
+"""Random crops and camera faults: they make a network trained on drawn streets less helpless on photographs."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from presight_core.classes import UNKNOWN
+
+CROP_HEIGHT_PX, CROP_WIDTH_PX = 224, 192  # half an image: twice as many different ones in a batch
+GREY_SHARE = 0.3  # of the samples: drives with grey cameras exist
+
+
+def random_crop(
+    rgb: NDArray[np.uint8], labels: NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A part of an image and of its label map, (224, 192), maybe mirrored, enlarged or stretched.
+
+    Stretched, because every image is brought to 16:9, whatever its own shape.
+    """
+    height, width = labels.shape
+    zoom_y = zoom_x = CROP_HEIGHT_PX / height
+    if rng.random() < 0.5:
+        zoom_y *= np.exp(rng.uniform(0.0, 0.5))
+        zoom_x = zoom_y * np.exp(rng.uniform(-0.65, 0.2))  # -0.6 is what a panorama of 3.3:1 suffers
+    zoom_x = max(zoom_x, CROP_WIDTH_PX / width)
+    left = rng.uniform(0, width - CROP_WIDTH_PX / zoom_x)
+    top = rng.uniform(0, height - CROP_HEIGHT_PX / zoom_y)
+    # Both grids have their first pixel's centre at 0.5, OpenCV's at 0.
+    crop_from_image = np.array(
+        [[zoom_x, 0, (0.5 - left) * zoom_x - 0.5], [0, zoom_y, (0.5 - top) * zoom_y - 0.5]], np.float64
+    )
+    if rng.random() < 0.5:
+        crop_from_image[0] = [-crop_from_image[0, 0], 0, CROP_WIDTH_PX - 1 - crop_from_image[0, 2]]
+    size = CROP_WIDTH_PX, CROP_HEIGHT_PX
+    crop = cv2.warpAffine(rgb, crop_from_image, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    crop_labels = cv2.warpAffine(
+        labels, crop_from_image, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN
+    )
+    return crop.astype(np.uint8, copy=False), crop_labels.astype(np.uint8, copy=False)
+
+
+def another_camera(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:
+    """The image (H, W, 3) in 0..1 as another camera might have taken it: grey, off-colour, dark, blurred, noisy."""
+    image: NDArray[np.floating] = rgb.astype(np.float32) / 255
+    if rng.random() < 0.3:
+        image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.3)).astype(np.float32)
+    image = _recoloured(image, rng)
+    if rng.random() < 0.8:
+        gamma, contrast, brightness = np.exp(rng.normal(0, 0.3)), rng.uniform(0.65, 1.35), rng.normal(0, 0.08)
+        image = (np.clip(image, 1e-3, 1) ** np.float32(gamma) - 0.5) * np.float32(contrast)
+        image += np.float32(0.5 + brightness)
+    if rng.random() < 0.3:
+        image = image + rng.standard_normal(image.shape, np.float32) * np.float32(rng.uniform(0.005, 0.05))
+    return np.clip(image, 0, 1).astype(np.float32, copy=False)
+
+
+def _recoloured(image: NDArray[np.floating], rng: np.random.Generator) -> NDArray[np.floating]:
+    if rng.random() < GREY_SHARE:
+        weights = rng.dirichlet((3, 5, 2)).astype(np.float32)  # about the eye's, as sensors differ
+        return np.repeat((image @ weights)[..., None], 3, axis=2)
+    grey = image.mean(axis=2, keepdims=True)
+    saturation = np.float32(rng.uniform(0.4, 1.4))
+    balance = np.exp(rng.normal(0, 0.08, 3)).astype(np.float32)
+    return (grey + (image - grey) * saturation) * balance

@@ -1,0 +1,118 @@
+"""The tiny network: one small U-Net that gives both logits and features, and its two ONNX files."""
+
+import warnings
+from pathlib import Path
+
+import onnx
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d, interpolate, relu
+
+from presight_core.classes import CITYSCAPES
+
+CLASS_COUNT = len(CITYSCAPES)
+FEATURE_CHANNELS = 64  # as many as a prior keeps
+INPUT_HEIGHT_PX, INPUT_WIDTH_PX = 224, 400  # 16:9 but for one row, and whole strides of 8
+LOGIT_STRIDE, FEATURE_STRIDE = 4, 8
+OPSET = (
+    17  # the newest that torch's own exporter writes without further packages and that every runtime since 2022 reads
+)
+
+
+class TinyNetwork(nn.Module):
+    """Encoder to stride 32, decoder to stride 8 (the features), one more step to stride 4 (the logits).
+
+    The features are the bounded bottleneck that the logits are made from, and a linear classifier reads the
+    classes off them during training: patches of one kind therefore lie together, which is what PCA and a
+    neural field need of them.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.to_stride_4 = nn.Sequential(_convolve(3, 16, 2), _convolve(16, 24, 2), _Residual(24))
+        self.to_stride_8 = nn.Sequential(_convolve(24, 48, 2), _Residual(48))
+        self.to_stride_16 = nn.Sequential(_convolve(48, 64, 2), _Residual(64))
+        self.to_stride_32 = nn.Sequential(_convolve(64, 96, 2), _Residual(96))
+        self.from_stride_32 = _convolve(96, FEATURE_CHANNELS, size=1)
+        self.from_stride_16 = _convolve(64, FEATURE_CHANNELS, size=1)
+        self.from_stride_8 = _convolve(48, FEATURE_CHANNELS, size=1)
+        self.from_stride_4 = nn.Conv2d(24, 32, 1)
+        self.refine_16 = _convolve(FEATURE_CHANNELS, FEATURE_CHANNELS)
+        self.refine_8 = _convolve(FEATURE_CHANNELS, FEATURE_CHANNELS)
+        self.to_features = nn.Conv2d(FEATURE_CHANNELS, FEATURE_CHANNELS, 1)
+        self.from_features = nn.Conv2d(FEATURE_CHANNELS, 32, 1)
+        self.refine_4 = _convolve(32, 32)
+        self.to_logits = nn.Conv2d(32, CLASS_COUNT, 1)
+        self.feature_classifier = nn.Conv2d(FEATURE_CHANNELS, CLASS_COUNT, 1)  # for training only
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (N, 19, H/4, W/4) and features (N, 64, H/8, W/8) in [-1, 1] of normalised images (N, 3, H, W)."""
+        at_4 = self.to_stride_4(image)
+        at_8 = self.to_stride_8(at_4)
+        at_16 = self.to_stride_16(at_8)
+        deep = self.from_stride_32(self.to_stride_32(at_16))
+        deep = deep + adaptive_avg_pool2d(deep, 1)  # the whole picture: night or day, street or park
+        deep = self.refine_16(self.from_stride_16(at_16) + _enlarged(deep, at_16))
+        deep = self.refine_8(self.from_stride_8(at_8) + _enlarged(deep, at_8))
+        features = torch.tanh(self.to_features(deep))
+        fine = relu(self.from_stride_4(at_4) + _enlarged(self.from_features(features), at_4))
+        return self.to_logits(self.refine_4(fine)), features
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int):
+        super().__init__()
+        self.first = _convolve(channels, channels)
+        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return relu(x + self.second(self.first(x)))
+
+
+class _Segmentation(nn.Module):
+    """Only the logits, so that the exported file holds one output."""
+
+    def __init__(self, network: TinyNetwork):
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.network(image)[0]
+
+
+class _Features(_Segmentation):
+    def forward(self, image: Tensor) -> Tensor:
+        return self.network(image)[1]
+
+
+def export(network: TinyNetwork, kind: str, file: Path) -> None:
+    """Write one ONNX file, input `image` (N, 3, 224, 400), output `logits` or `features`; N is free.
+
+    kind: "segmentation" or "features".
+    """
+    module = (_Segmentation if kind == "segmentation" else _Features)(network.eval())
+    output = "logits" if kind == "segmentation" else "features"
+    example = torch.zeros(1, 3, INPUT_HEIGHT_PX, INPUT_WIDTH_PX)
+    with warnings.catch_warnings():
+        # torch's newer exporter needs onnxscript, which nothing else here does.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(
+            module,
+            (example,),
+            str(file),
+            input_names=["image"],
+            output_names=[output],
+            dynamic_axes={"image": {0: "images"}, output: {0: "images"}},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+    onnx.checker.check_model(str(file), full_check=True)
+
+
+def _convolve(inputs: int, outputs: int, stride: int = 1, size: int = 3) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+def _enlarged(x: Tensor, like: Tensor) -> Tensor:
+    return interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)

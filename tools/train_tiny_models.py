@@ -1,0 +1,206 @@
+"""Train the tiny segmentation and feature networks that come with PreSight, and write them with their cards.
+
+    python tools/train_tiny_models.py --steps 3000 --out presight_core/models/tiny
+
+Everything is drawn: the networks learn the classes of the procedural city from many small cities. They stand in
+for SegFormer and DINO in the demo and in tests, and say so on their cards.
+"""
+
+import argparse
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tiny_augment import another_camera, random_crop
+from tiny_network import (
+    CLASS_COUNT,
+    FEATURE_CHANNELS,
+    FEATURE_STRIDE,
+    INPUT_HEIGHT_PX,
+    INPUT_WIDTH_PX,
+    LOGIT_STRIDE,
+    TinyNetwork,
+    export,
+)
+from tiny_scores import Scores, confusion, neighbour_accuracy, scores
+from tiny_views import LabelledImages, training_views, unseen_views
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from presight_core.classes import UNKNOWN
+
+MEAN, STD = (0.45, 0.45, 0.45), (0.25, 0.25, 0.25)  # of street pictures, roughly; batch normalisation does the rest
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One training; the defaults are the shipped pair's."""
+
+    steps: int = 3000
+    rigs: int = 160  # six images each
+    unseen_rigs: int = 30
+    batch_size: int = 4  # many small steps beat few large ones in a training of minutes
+    learning_rate: float = 5e-3
+    class_weight_power: float = 0.4  # 0: every pixel counts alike; 1: every class
+    feature_loss_weight: float = 0.4
+    seed: int = 0
+    threads: int = 1
+
+
+def train(views: LabelledImages, recipe: Recipe, report: Callable[[int, float], None]) -> TinyNetwork:
+    """A network trained on labelled images; `report(step, loss)` is called at every step."""
+    torch.manual_seed(recipe.seed)
+    torch.set_num_threads(recipe.threads)
+    rng = np.random.default_rng(recipe.seed)
+    network = TinyNetwork()
+    weights = class_weights(views.labels, recipe.class_weight_power)
+    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=0.02)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, recipe.learning_rate, total_steps=recipe.steps, pct_start=0.15
+    )
+    for step, (images, labels) in enumerate(_batches(views, recipe, rng), 1):
+        logits, features = network(images)
+        loss = _loss(logits, labels, weights, rng)
+        loss = loss + recipe.feature_loss_weight * _loss(network.feature_classifier(features), labels, weights, rng)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        report(step, loss.item())
+    return network.eval()
+
+
+def class_weights(labels: NDArray[np.uint8], power: float) -> Tensor:
+    """Weights (19,) of the classes' losses, frequency to the power of -`power`, 1 on average over pixels."""
+    frequency = np.bincount(labels.ravel(), minlength=UNKNOWN + 1)[:CLASS_COUNT] / labels.size
+    weights = np.maximum(frequency, 5e-4) ** -power  # the floor: a class of a few pixels must not rule the rest
+    return torch.tensor(weights / (weights * frequency).sum(), dtype=torch.float32)
+
+
+def _batches(views: LabelledImages, recipe: Recipe, rng: np.random.Generator) -> Iterator[tuple[Tensor, Tensor]]:
+    for _ in range(recipe.steps):
+        chosen = rng.integers(len(views.rgb), size=recipe.batch_size)
+        crops = [random_crop(views.rgb[k], views.labels[k], rng) for k in chosen]
+        images = np.stack([another_camera(rgb, rng) for rgb, _ in crops])
+        labels = np.stack([labels for _, labels in crops]).astype(np.int64)
+        yield _network_input(images), torch.from_numpy(labels)
+
+
+def _network_input(images: NDArray[np.float32]) -> Tensor:
+    """Normalised images (N, 3, H, W) of RGB (N, H, W, 3) in 0..1, laid out channels last, which is faster."""
+    normalised = (images - np.array(MEAN, np.float32)) / np.array(STD, np.float32)
+    return torch.from_numpy(normalised).permute(0, 3, 1, 2)
+
+
+def _loss(logits: Tensor, labels: Tensor, weights: Tensor, rng: np.random.Generator) -> Tensor:
+    """Cross-entropy of every cell with one of its pixels, another at each step: on average with all of them."""
+    stride = labels.shape[-1] // logits.shape[-1]
+    row, column = rng.integers(stride, size=2)
+    return cross_entropy(logits, labels[:, row::stride, column::stride], weights, ignore_index=UNKNOWN)
+
+
+def measure(network: TinyNetwork, views: LabelledImages) -> Scores:
+    """Scores on images in the order of their cities."""
+    size = INPUT_WIDTH_PX, INPUT_HEIGHT_PX
+    labels = np.stack([cv2.resize(each, size, interpolation=cv2.INTER_NEAREST) for each in views.labels])
+    matrix = np.zeros((CLASS_COUNT, CLASS_COUNT), np.int64)
+    features = []
+    for rgb, truth in zip(views.rgb, labels, strict=True):
+        image = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        with torch.inference_mode():
+            logits, feature = network(_network_input(image[None]))
+        matrix += confusion(logits.argmax(1)[0].numpy().astype(np.uint8), truth)
+        features.append(feature[0].numpy())
+    neighbours = neighbour_accuracy(np.stack(features), labels, np.random.default_rng(0))
+    return scores(matrix, neighbours)
+
+
+def write_models(network: TinyNetwork, measured: Scores, recipe: Recipe, folder: Path) -> None:
+    """The ONNX pair and its cards."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind, output, stride, channels in (
+        ("segmentation", "logits", LOGIT_STRIDE, CLASS_COUNT),
+        ("features", "features", FEATURE_STRIDE, FEATURE_CHANNELS),
+    ):
+        file = folder / f"{kind}.onnx"
+        export(network, kind, file)
+        note = (
+            "A stand-in for the demo and for tests: a small U-Net supervised on the procedural city's own classes "
+            f"for {recipe.steps} steps. It is not DINO or SegFormer; use those for real drives. {measured.summary()}"
+        )
+        card = {
+            "name": f"tiny-{kind}",
+            "kind": kind,
+            "file": file.name,
+            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+            "input": "image",
+            "input_height_px": INPUT_HEIGHT_PX,
+            "input_width_px": INPUT_WIDTH_PX,
+            "mean": list(MEAN),
+            "std": list(STD),
+            "output": output,
+            "layout": "NCHW",
+            "stride": stride,
+            "channels": channels,
+            "licence": "Apache-2.0",
+            "source": "tools/train_tiny_models.py of PreSight",
+            "note": note,
+        }
+        lines = [f"{key} = {json.dumps(value)}" for key, value in card.items()]  # JSON's values are TOML's here
+        (folder / f"{kind}.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def rendered(parts: Iterator[LabelledImages], total: int, what: str) -> LabelledImages:
+    """All views in one, with a line of progress."""
+    started, views = time.process_time(), []
+    for done, part in enumerate(parts, 1):
+        views.append(part)
+        print(f"\r{what}: {done} of {total} rigs, {time.process_time() - started:.0f} CPU s", end="", flush=True)
+    print()
+    return LabelledImages(np.concatenate([v.rgb for v in views]), np.concatenate([v.labels for v in views]))
+
+
+class _Progress:
+    """Prints the running mean of the loss now and then."""
+
+    def __init__(self, steps: int):
+        self._steps, self._started, self._mean = steps, time.process_time(), 0.0
+
+    def __call__(self, step: int, loss: float) -> None:
+        keep = min(0.98, 1 - 1 / step)  # the mean of the last 50 steps or so
+        self._mean = keep * self._mean + (1 - keep) * loss
+        if step % 20 == 0 or step == self._steps:
+            cpu_s = time.process_time() - self._started
+            print(f"\rtraining: {step} of {self._steps}, loss {self._mean:.3f}, {cpu_s:.0f} CPU s", end="", flush=True)
+        if step == self._steps:
+            print()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Train the tiny segmentation and feature networks.")
+    parser.add_argument("--steps", type=int, default=Recipe.steps)
+    parser.add_argument("--rigs", type=int, default=Recipe.rigs, help="places to render for training, six images each")
+    parser.add_argument("--unseen-rigs", type=int, default=Recipe.unseen_rigs, help="places to render for measuring")
+    parser.add_argument("--seed", type=int, default=Recipe.seed)
+    parser.add_argument("--threads", type=int, default=Recipe.threads)
+    parser.add_argument("--out", type=Path, default=Path("presight_core/models/tiny"), help="folder of the models")
+    arguments = vars(parser.parse_args())
+    folder = arguments.pop("out")
+    recipe = Recipe(**arguments)
+    views = rendered(training_views(recipe.rigs, recipe.seed, recipe.threads), recipe.rigs, "training views")
+    network = train(views, recipe, _Progress(recipe.steps))
+    unseen = rendered(unseen_views(recipe.unseen_rigs, recipe.threads), recipe.unseen_rigs, "unseen views")
+    measured = measure(network, unseen)
+    print(measured.summary())
+    write_models(network, measured, recipe, folder)
+
+
+if __name__ == "__main__":
+    main()
