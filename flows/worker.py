@@ -47,9 +47,8 @@ def extract_features(job: Job) -> dict[str, Any]:
 
 def train(job: Job) -> dict[str, Any]:
     """A trained field in the tile's scratch folder, with its held-out metrics and pictures."""
-    from stages.evaluation import evaluate_tile
-
     from presight_core.field.checkpoint import load_field
+    from stages.evaluation import evaluate_tile
     from stages.training import train_tile
 
     record = job.scratch / "training.json"
@@ -65,10 +64,9 @@ def train(job: Job) -> dict[str, Any]:
 
 def extract(job: Job) -> dict[str, Any]:
     """The tile's voxels, written to the store as one group that no generation shows yet."""
-    from stages.extraction import TileExtraction, extract_tile
-
     from presight_core.field.checkpoint import load_field
     from presight_core.grid import Lattice
+    from stages.extraction import TileExtraction, extract_tile
     from storage.tile_groups import TileName
 
     started = time.monotonic()

@@ -13,7 +13,7 @@ from presight_core.cameras import Camera
 class Drive:
     """One nuScenes scene: immutable, named by the digest of its content."""
 
-    drive_id: str  # first 16 hex digits of the SHA-256 of the frames' rows: poses, intrinsics, times, paths, sizes
+    drive_id: str  # head of the SHA-256 over the city and the frames' poses, intrinsics, times, paths and sizes
     name: str  # scene name, "scene-0061"
     city: str  # log location, "singapore-onenorth"
     root: str  # dataset root: a folder or URL that frame paths are relative to

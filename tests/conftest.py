@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.tiny_dataset import TinyDataset
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
@@ -15,3 +17,9 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent: set PRESIGHT_SHARED to the folder that holds data/")
     return folder
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> TinyDataset:
+    """A sound data set in the nuScenes format, not yet written."""
+    return TinyDataset(tmp_path / "data")

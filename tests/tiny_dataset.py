@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from PIL import Image
 
 START_US = 1_600_000_000_000_000
@@ -127,9 +126,3 @@ class TinyDataset:
         self.folder.mkdir(parents=True, exist_ok=True)
         for name, rows in self.tables.items():
             (self.folder / f"{name}.json").write_text(json.dumps(rows, indent=0))
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> TinyDataset:
-    """A sound data set, not yet written."""
-    return TinyDataset(tmp_path / "data")
