@@ -44,7 +44,8 @@ def run_city(workspace: Workspace, plan: CityPlan, overrides: list[str], paralle
     cores = len(os.sched_getaffinity(0))
     wanted = parallel or (cores if devices == ["cpu"] else len(devices))
     at_once = max(1, min(wanted, len(plan.stale)))
-    run = rebuild_city.with_options(task_runner=ThreadPoolTaskRunner(max_workers=at_once))
+    runner: Any = ThreadPoolTaskRunner(max_workers=at_once)  # Prefect's own types do not fit each other here
+    run = rebuild_city.with_options(task_runner=runner)
     return run(str(workspace.root), plan.city, overrides, max(1, cores // at_once), devices)
 
 
@@ -134,9 +135,8 @@ def _build_tiles(jobs: dict[str, Job], broken: dict[str, str]) -> tuple[list[Bui
     }
     trained = {tile_id: tasks.train_tile.submit(job) for tile_id, job in jobs.items() if tile_id not in failed}
     # Extractions queue behind all trainings, so that none holds a thread while it waits for its field.
-    extracted = {
-        tile_id: tasks.extract_tile.submit(jobs[tile_id], wait_for=[future]) for tile_id, future in trained.items()
-    }
+    extract: Any = tasks.extract_tile  # Prefect's overloads of `submit` know no `wait_for` here
+    extracted = {tile_id: extract.submit(jobs[tile_id], wait_for=[future]) for tile_id, future in trained.items()}
     built = []
     for tile_id, future in trained.items():
         try:
