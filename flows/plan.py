@@ -120,14 +120,14 @@ def tile_frames(frames: FrameTable, city_tiling: Tiling, tile: int, settings: Ci
 def space_key(settings: CitySettings) -> dict[str, Any]:
     """What decides which feature space is used: the feature model and the number of channels."""
     card = ModelCard.load(settings.features.feature_model, "features")
-    return {"feature_model": card.sha256, "channels": settings.features.channels}
+    return {"feature_model": card.identity, "channels": settings.features.channels}
 
 
 def features_recipe(settings: CitySettings, space_id: str) -> Recipe:
     """The recipe of every drive's label maps and features."""
     models = {
-        "segmentation_model": ModelCard.load(settings.features.segmentation_model, "segmentation").sha256,
-        "feature_model": ModelCard.load(settings.features.feature_model, "features").sha256,
+        "segmentation_model": ModelCard.load(settings.features.segmentation_model, "segmentation").identity,
+        "feature_model": ModelCard.load(settings.features.feature_model, "features").identity,
         "space": space_id,
     }
     chosen = {"masks": settings.features.masks, "keyframes_only": settings.training.keyframes_only}
