@@ -1,7 +1,40 @@
 """How this package compiles its kernels."""
 
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import numba
 
 # nogil: views render side by side in threads, each kernel on its own arrays.
 # fastmath: reassociation changes the last bits only, and the same build gives the same bytes.
-jit = numba.njit(cache=True, nogil=True, fastmath=True)
+_OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True}
+
+# What Python calls: kept on disk.
+kernel = numba.njit(cache=True, **_OPTIONS)
+
+# What kernels call: becomes part of them; wrappers for Python and C would double the time to compile.
+_BARE: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_OPTIONS}
+inner = numba.njit(**_BARE)
+
+# What takes whole scenes: pasted into its caller, since passing three dozen arrays costs more than most calls do.
+spliced = numba.njit(inline="always", **_OPTIONS)
+
+
+def typed(signature: str) -> Callable:
+    """Like `inner`, compiled once for this signature; otherwise every literal argument makes another copy."""
+    return numba.njit(signature, cache=True, **_OPTIONS)
+
+
+def _drop_stale_kernels() -> None:
+    """Delete kernels older than any source here: numba looks at the file of the outermost function only."""
+    folder = Path(__file__).parent
+    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
+    for index in (folder / "__pycache__").glob("*.nbi"):
+        with contextlib.suppress(OSError):  # gone already, or an installation we may not write to
+            if index.stat().st_mtime < newest:
+                index.unlink()
+
+
+_drop_stale_kernels()

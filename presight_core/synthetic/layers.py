@@ -64,13 +64,28 @@ def lay_streets(graph: StreetGraph, size_m: float) -> StreetLayers:
         road=road,
         drivable=polygons(road),
         walkway=polygons(with_walkway.difference(road).simplify(SNAP_M)),
-        blocks=polygons(shapely.box(0, 0, size_m, size_m).difference(with_walkway)),
+        blocks=_blocks(shapely.box(0, 0, size_m, size_m).difference(with_walkway)),
     )
     for edge in graph.edges:
         _lay_street(layers, graph, edge)
     between = road.difference(unary_union([polygon for polygon, _ in layers.segments]).buffer(0.01))
     layers.intersections = [polygon for polygon in polygons(between) if polygon.area > 30]  # less: a rounded corner
     return layers
+
+
+def _blocks(ground: BaseGeometry) -> list[Polygon]:
+    """The ground between streets, block by block; what lies around the outermost streets is cut into pieces."""
+    blocks = []
+    for part in polygons(ground):
+        if not part.interiors:
+            blocks.append(part)
+            continue
+        low_x, low_y, high_x, high_y = part.bounds
+        cuts = np.linspace(0, 1, 4)  # three pieces a side
+        for i, j in np.ndindex(3, 3):
+            cell_x, cell_y = low_x + cuts[[i, i + 1]] * (high_x - low_x), low_y + cuts[[j, j + 1]] * (high_y - low_y)
+            blocks += polygons(shapely.clip_by_rect(part, cell_x[0], cell_y[0], cell_x[1], cell_y[1]))
+    return blocks
 
 
 def _lay_street(layers: StreetLayers, graph: StreetGraph, edge: Edge) -> None:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from presight_core.synthetic.jit import jit
+from presight_core.synthetic.jit import typed
 
 
-@jit
+@typed("float64(int64, int64, int64)")
 def hash01(x: int, y: int, seed: int) -> float:
     """A number in [0, 1) that looks random, of two integers and a seed."""
     # Odd 32-bit constants with well spread bits (the primes of xxHash), then two xor-shift-multiply rounds.
@@ -16,7 +16,7 @@ def hash01(x: int, y: int, seed: int) -> float:
     return np.float64(h & np.uint32(0xFFFFFF)) / 16777216.0  # 2^24
 
 
-@jit
+@typed("float64(float64, float64, int64)")
 def value_noise(x: float, y: float, seed: int) -> float:
     """Smooth noise in [0, 1) of wavelength about 1."""
     column, row = int(np.floor(x)), int(np.floor(y))
@@ -28,13 +28,13 @@ def value_noise(x: float, y: float, seed: int) -> float:
     return low * (1 - v) + high * v
 
 
-@jit
+@typed("float64(float64, float64)")
 def detail_strength(wavelength_m: float, footprint_m: float) -> float:
     """How much of a detail survives a pixel of the given footprint: 1 when fine, 0 when under-sampled."""
     return min(max(1.5 - 3 * footprint_m / wavelength_m, 0.0), 1.0)  # gone at half a wavelength a pixel (Nyquist)
 
 
-@jit
+@typed("float64(float64, float64, float64, float64, int64)")
 def band(x: float, y: float, wavelength_m: float, footprint_m: float, seed: int) -> float:
     """Zero-mean noise in [-0.5, 0.5) of one wavelength, faded out where pixels cannot carry it."""
     strength = detail_strength(wavelength_m, footprint_m)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from presight_core.synthetic.jit import jit
+from presight_core.synthetic.jit import inner, kernel
 from presight_core.synthetic.mesh import Mesh
 
 EDGE_TOLERANCE = 1e-6  # samples; neighbours overlap by this much rather than leave a crack
@@ -30,7 +30,7 @@ class PinholeView(NamedTuple):
     far_m: float
 
 
-@jit
+@inner
 def draw_triangle(x0, y0, n0, x1, y1, n1, x2, y2, n2, face, nearness, faces):
     """Fill one triangle given by sample coordinates and nearness at its corners."""
     height, width = nearness.shape
@@ -54,7 +54,7 @@ def draw_triangle(x0, y0, n0, x1, y1, n1, x2, y2, n2, face, nearness, faces):
                 faces[row, column] = face
 
 
-@jit
+@inner
 def span(x0, y0, x1, y1, x2, y2, row):
     """The interval of x that the triangle covers on one row."""
     low, high = np.inf, -np.inf
@@ -63,7 +63,7 @@ def span(x0, y0, x1, y1, x2, y2, row):
     return widen_span(x2, y2, x0, y0, row, low, high)
 
 
-@jit
+@inner
 def widen_span(xa, ya, xb, yb, row, low, high):
     """`low` and `high` with the crossing of one edge and the row added, if they meet."""
     if min(ya, yb) - EDGE_TOLERANCE > row or max(ya, yb) + EDGE_TOLERANCE < row:
@@ -75,7 +75,7 @@ def widen_span(xa, ya, xb, yb, row, low, high):
     return min(low, x), max(high, x)
 
 
-@jit
+@kernel
 def draw_perspective(mesh: Mesh, view: PinholeView, first_face: int, nearness, faces):
     """Draw a mesh as a camera sees it; `first_face` is added to its face indices."""
     width = nearness.shape[1]
@@ -108,18 +108,21 @@ def draw_perspective(mesh: Mesh, view: PinholeView, first_face: int, nearness, f
                 draw_clipped(corners, clipped, view, face + first_face, nearness, faces)
 
 
-@jit
+@inner
 def draw_clipped(corners, clipped, view, face, nearness, faces):
     """Cut a triangle in camera coordinates at the near plane, project and draw it."""
     count = 0
     for k in range(3):
-        a, b = corners[k], corners[(k + 1) % 3]
-        if a[2] >= view.near_m:
-            clipped[count] = a
+        following = (k + 1) % 3
+        depth, next_depth = corners[k, 2], corners[following, 2]
+        if depth >= view.near_m:
+            for axis in range(3):
+                clipped[count, axis] = corners[k, axis]
             count += 1
-        if (a[2] >= view.near_m) != (b[2] >= view.near_m):
-            t = (view.near_m - a[2]) / (b[2] - a[2])
-            clipped[count] = a + t * (b - a)
+        if (depth >= view.near_m) != (next_depth >= view.near_m):
+            t = (view.near_m - depth) / (next_depth - depth)
+            for axis in range(3):
+                clipped[count, axis] = corners[k, axis] + t * (corners[following, axis] - corners[k, axis])
             count += 1
     for k in range(count):
         near = 1.0 / clipped[k, 2]
@@ -134,7 +137,7 @@ def draw_clipped(corners, clipped, view, face, nearness, faces):
         )  # fmt: skip
 
 
-@jit
+@kernel
 def draw_orthographic(mesh: Mesh, axes, origin, sample_m: float, nearness, faces):
     """Draw a mesh as parallel light sees it.
 
@@ -151,10 +154,11 @@ def draw_orthographic(mesh: Mesh, axes, origin, sample_m: float, nearness, faces
             continue
         for face in range(mesh.chunks[chunk, 0], mesh.chunks[chunk, 1]):
             for k in range(3):
-                q = mesh.vertices[mesh.faces[face, k]]
-                p[k, 0] = (axes[0, 0] * q[0] + axes[0, 1] * q[1] + axes[0, 2] * q[2] - origin[0]) / sample_m
-                p[k, 1] = (axes[1, 0] * q[0] + axes[1, 1] * q[1] + axes[1, 2] * q[2] - origin[1]) / sample_m
-                p[k, 2] = axes[2, 0] * q[0] + axes[2, 1] * q[1] + axes[2, 2] * q[2]
+                vertex = mesh.faces[face, k]
+                x, y, z = mesh.vertices[vertex, 0], mesh.vertices[vertex, 1], mesh.vertices[vertex, 2]
+                p[k, 0] = (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z - origin[0]) / sample_m
+                p[k, 1] = (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z - origin[1]) / sample_m
+                p[k, 2] = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
             draw_triangle(
                 p[0, 0], p[0, 1], p[0, 2], p[1, 0], p[1, 1], p[1, 2], p[2, 0], p[2, 1], p[2, 2],
                 face, nearness, faces,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from presight_core.synthetic.jit import jit
+from presight_core.synthetic.jit import inner, kernel, spliced
 from presight_core.synthetic.lighting import Lighting
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import Mesh
@@ -39,7 +39,7 @@ class Scene(NamedTuple):
     actor_sky: ShadowMap
 
 
-@jit
+@inner
 def sky_colour(dx, dy, dz, light):
     """Sky radiance (red, green, blue) in a unit direction."""
     up = max(dz, 0.0)
@@ -62,7 +62,7 @@ def sky_colour(dx, dy, dz, light):
     return red, green, blue
 
 
-@jit
+@spliced
 def shade_point(scene, face, ray, depth, focal, position):
     """Radiance towards the camera of a face seen along `ray` (unit depth, world axes) at an optical-axis depth."""
     light = scene.lighting
@@ -86,8 +86,8 @@ def shade_point(scene, face, ray, depth, focal, position):
         material, x, y, z, (nx, ny, nz), mesh.walls[face], mesh.colours[face], footprint, light.lamps
     )
     if material == _FOLIAGE:  # leaves point anywhere
-        nx += value_noise(3 * x + 7, 3 * z, 33) - 0.5
-        ny += value_noise(3 * y, 3 * z + 9, 34) - 0.5
+        nx += 1.6 * (value_noise(4 * x + 7, 4 * z, 33) - 0.5)
+        ny += 1.6 * (value_noise(4 * y, 4 * z + 9, 34) - 0.5)
         norm = np.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx / norm, ny / norm, nz / norm
     sun, sky = received(scene, material, (x, y, z), (nx, ny, nz))
@@ -104,7 +104,7 @@ def shade_point(scene, face, ray, depth, focal, position):
     return red + (far[0] - red) * haze, green + (far[1] - green) * haze, blue + (far[2] - blue) * haze
 
 
-@jit
+@inner
 def surface(material, x, y, z, normal, wall, colour, footprint, lamps):
     """Reflectance (3), gloss and emitted radiance (3) of a surface point."""
     red, green, blue = float(colour[0]), float(colour[1]), float(colour[2])
@@ -136,7 +136,7 @@ def surface(material, x, y, z, normal, wall, colour, footprint, lamps):
     return red, green, blue, 0.0, 0.0, 0.0, 0.0
 
 
-@jit
+@spliced
 def received(scene, material, point, normal):
     """How much sun (cosine and shadows) and how much of the open sky reach a point."""
     # A step off the surface, so that it does not shade itself.
@@ -144,7 +144,9 @@ def received(scene, material, point, normal):
     sky = 0.62 + 0.38 * normal[2]  # walls see half of the sky, and some light from the street
     city = occlusion(scene.shadows.sky, x, y, z, 2.4, 0.5)  # under trees, awnings, balconies
     sky *= 1 - 0.45 * city
-    sky *= 1 - 0.65 * occlusion(scene.actor_sky, x, y, z, 0.5, 0.1)  # under cars
+    is_low = z < 4.0  # no actor reaches higher
+    if is_low:
+        sky *= 1 - 0.65 * occlusion(scene.actor_sky, x, y, z, 0.5, 0.1)  # under cars
     if material in (_FACADE, _ROOF, _CURB):
         sky *= 0.75 + 0.25 * min(max(z / 4, 0.0), 1.0)  # narrow streets are darker at the bottom
     to_sun = scene.lighting.to_sun
@@ -152,18 +154,18 @@ def received(scene, material, point, normal):
     if sun <= 0:
         return 0.0, sky
     sun *= 1 - occlusion(scene.shadows.sun, x, y, z, 0.15, 0.2)
-    if sun > 0:
+    if is_low and sun > 0:
         sun *= 1 - occlusion(scene.actor_sun, x, y, z, 0.1, 0.1)
     return sun, sky
 
 
-@jit
+@inner
 def display(radiance, exposure):
     """Film-like response: linear in the shadows, no hard clipping in the lights; then the 2.2 display curve."""
     return (1 - np.exp(-max(radiance, 0.0) * exposure)) ** 0.4545
 
 
-@jit
+@spliced
 def sample_colour(scene, view, face, row, column, nearness):
     """Displayed colour (3) of what one sample sees; `view` is in sample coordinates."""
     cx = (column - view.centre_x) / view.focal_x
@@ -187,7 +189,7 @@ def sample_colour(scene, view, face, row, column, nearness):
     )
 
 
-@jit
+@kernel
 def shade_view(scene: Scene, view: PinholeView, nearness, faces, seed: int, rgb):
     """Fill `rgb` (H, W, 3) uint8 from sample buffers (2 H + 1, 2 W + 1)."""
     height, width = rgb.shape[0], rgb.shape[1]
@@ -203,7 +205,7 @@ def shade_view(scene: Scene, view: PinholeView, nearness, faces, seed: int, rgb)
                 rgb[row, column, channel] = np.uint8(min(max(seen * 255 + 0.5, 0.0), 255.0))
 
 
-@jit
+@spliced
 def pixel_colour(scene, view, nearness, faces, row, column):
     """Tent-filtered colour of the pixel whose centre sample is (row, column); faces are shaded once each."""
     red, green, blue = 0.0, 0.0, 0.0

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from presight_core.synthetic.jit import jit
+from presight_core.synthetic.jit import inner
 from presight_core.synthetic.lighting import Colour, Lighting, light_axes
 from presight_core.synthetic.mesh import Mesh
 from presight_core.synthetic.raster import draw_orthographic
@@ -49,7 +49,7 @@ def cast_shadows(mesh: Mesh, lighting: Lighting, centre: ArrayLike, radius_m: fl
     return Shadows(sun, shadow_map(mesh, ZENITH, centre, radius_m, SKY_SAMPLE_M))
 
 
-@jit
+@inner
 def occlusion(shadow, x, y, z, spread_m, bias_m):
     """Share of light that is blocked at a point, 0..1, from four bilinear taps `spread_m` apart."""
     axes = shadow.axes
@@ -64,7 +64,7 @@ def occlusion(shadow, x, y, z, spread_m, bias_m):
     return total / 4
 
 
-@jit
+@inner
 def blocked(height_m, u, v, threshold):
     """Bilinear share of the four samples around (u, v) that stand above a threshold."""
     column, row = int(np.floor(u)), int(np.floor(v))

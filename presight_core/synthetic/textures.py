@@ -7,7 +7,7 @@ Every function fades details out that a pixel of the given footprint (metres on 
 
 import numpy as np
 
-from presight_core.synthetic.jit import jit
+from presight_core.synthetic.jit import inner
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.noise import band, detail_strength, hash01, value_noise
 
@@ -22,24 +22,24 @@ _GRASS, _PLAZA, _FACADE, _ROOF, _TRUNK, _FOLIAGE = (
 _FENCE, _GARDEN_WALL, _FAR_GROUND = int(Material.FENCE), int(Material.GARDEN_WALL), int(Material.FAR_GROUND)
 
 
-@jit
+@inner
 def is_ground(material):
     """Whether a material lies flat: its footprint stretches along the view."""
     return material <= _PLAZA or material == _FAR_GROUND
 
 
-@jit
+@inner
 def line_strength(distance_m, half_width_m, footprint_m):
     """How dark a thin line makes a pixel: 1 on it, thinner than a pixel in proportion."""
     reach = max(half_width_m, footprint_m)
     return max(1.0 - distance_m / reach, 0.0) * min(half_width_m / reach, 1.0)
 
 
-@jit
+@inner
 def asphalt(x, y, footprint):
     """Brightness of road surface: grain, wear, repairs, sealed cracks, manholes."""
-    k = 1 + 0.35 * band(x, y, 7.0, footprint, 1) + 0.35 * band(x, y, 1.3, footprint, 2)
-    k += 0.35 * band(x, y, 0.35, footprint, 3) + 0.35 * band(x, y, 0.09, footprint, 4)
+    k = 1 + 0.35 * band(x, y, 7.0, footprint, 1) + 0.45 * band(x, y, 1.3, footprint, 2)
+    k += 0.5 * band(x, y, 0.35, footprint, 3) + 0.35 * band(x, y, 0.09, footprint, 4)
     u, v = (0.8 * x + 0.6 * y) / 7.0, (0.8 * y - 0.6 * x) / 5.0  # repairs: rectangles in cells of 7 x 5 m
     column, row = int(np.floor(u)), int(np.floor(v))
     kind = hash01(column, row, 5)
@@ -61,14 +61,14 @@ def asphalt(x, y, footprint):
     return k
 
 
-@jit
+@inner
 def wear(x, y):
     """How much of a road marking is gone, 0..0.75."""
     spots = 0.6 * value_noise(x / 0.25, y / 0.25, 14) + 0.6 * value_noise(x / 1.7, y / 1.7, 15)
     return min(max((spots - 0.80) * 4, 0.0), 0.75)
 
 
-@jit
+@inner
 def tiles(x, y, size, footprint):
     """Brightness of paving with joints."""
     u, v = x / size, y / size
@@ -79,14 +79,14 @@ def tiles(x, y, size, footprint):
     return k * (1 - 0.4 * line_strength(gap, 0.02, footprint))
 
 
-@jit
+@inner
 def grass(x, y, footprint):
     """Brightness of grass, and how dry it is (0..1)."""
     k = 1 + 0.5 * band(x, y, 9.0, footprint, 19) + 0.5 * band(x, y, 1.6, footprint, 20)
     return k + 0.7 * band(x, y, 0.2, footprint, 21), value_noise(x / 13.0, y / 13.0, 22)
 
 
-@jit
+@inner
 def facade(x, y, z, normal, wall, footprint, colour, lamps):
     """Reflectance, gloss and emission of a wall with windows: (red, green, blue, gloss, light)."""
     along = -normal[1] * x + normal[0] * y - wall[0]
@@ -123,7 +123,7 @@ def facade(x, y, z, normal, wall, footprint, colour, lamps):
     return colour[0] * k, colour[1] * k, colour[2] * k, 0.0, 0.0
 
 
-@jit
+@inner
 def window(from_side_m, from_sill_m, u, v, bay, floor, lamps):
     """Glass with a frame; some are lit when it gets dark, some have curtains."""
     if from_side_m < 0.07 or from_sill_m < 0.07 or abs(u - 0.5) < 0.012:
@@ -136,7 +136,7 @@ def window(from_side_m, from_sill_m, u, v, bay, floor, lamps):
     return 0.04 + 0.06 * t, 0.05 + 0.06 * t, 0.06 + 0.07 * t, 0.40, light
 
 
-@jit
+@inner
 def fence(along, up, k):
     """Brightness of a slatted fence."""
     slat = along / 0.14
@@ -147,7 +147,7 @@ def fence(along, up, k):
     )
 
 
-@jit
+@inner
 def brightness(material, x, y, z, normal, footprint):
     """Texture of all materials that only vary in brightness."""
     if material == _ASPHALT:

@@ -9,7 +9,7 @@ from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import Surface, cylinder, sphere
 
 CROWN_COUNT = 6  # different crowns of a city; turned and scaled, more would not be noticed
-CLUSTER_COUNT = 70  # leaf clusters of a crown
+CLUSTER_COUNT = 100  # leaf clusters of a crown
 
 
 def plant_trees(site: Site) -> None:
@@ -22,7 +22,7 @@ def plant_trees(site: Site) -> None:
         foot_m = float(height_m(*spot)) + 0.1
         trunk_m, radius_m = rng.uniform(1.9, 3.0), rng.uniform(1.4, 2.5)
         bark = Surface(Material.TRUNK, (0.22, 0.16, 0.11), instance)
-        trunk = trunk_vertices * [0.07 * radius_m, 0.07 * radius_m, trunk_m + radius_m] + [*spot, foot_m]
+        trunk = trunk_vertices * [0.07 * radius_m, 0.07 * radius_m, trunk_m + 0.8 * radius_m] + [*spot, foot_m]
         site.builder.add(trunk, trunk_faces, bark)
         vertices, faces = crowns[int(rng.integers(CROWN_COUNT))]
         turn = rng.uniform(0, 2 * np.pi)
@@ -30,7 +30,9 @@ def plant_trees(site: Site) -> None:
         turned = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, rng.uniform(0.9, 1.4)]])
         leaf = np.array(site.style.foliage) * rng.uniform(0.7, 1.25) + rng.uniform(-0.02, 0.03, 3)
         surface = Surface(Material.FOLIAGE, tuple(np.clip(leaf, 0.02, 0.4)), instance)
-        site.builder.add(turned * radius_m + [*spot, foot_m + trunk_m + 0.75 * radius_m], faces, surface)
+        crown = turned * radius_m
+        crown[:, 2] += foot_m + trunk_m - 0.3 - crown[:, 2].min()  # the lowest leaves hide the end of the trunk
+        site.builder.add(crown + np.array([*spot, 0]), faces, surface)
 
 
 def _crown(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -58,6 +60,6 @@ def _leaf_clusters(rng: np.random.Generator) -> NDArray[np.float64]:
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(first, rng.standard_normal((CLUSTER_COUNT, 3)))
     second /= np.linalg.norm(second, axis=1, keepdims=True)
-    size = rng.uniform(0.10, 0.24, (CLUSTER_COUNT, 1))
+    size = rng.uniform(0.08, 0.2, (CLUSTER_COUNT, 1))
     corners = [centres + a * first * size + b * second * size for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     return np.stack(corners, 1).reshape(-1, 3)
