@@ -80,20 +80,26 @@ def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Re
     if not len(rows):
         raise InputError(f"tile {job.tile_id}: none of its {len(job.frames)} frames is for training; ingest more")
     run = Run(job, scratch)
-    pools = _Pools(job, source, rows)
-    log = _Log(job, scratch, report)
-    settings = job.settings.training
+    if run.step < job.settings.training.steps:
+        report(Progress("training", run.step, job.settings.training.steps))
+        pools = _Pools(job, source, rows)
+        with _Log(job, scratch, report) as log:
+            _train(job, run, pools, log)
+    checkpoint.save_field(scratch / "field", run.field)
+    return TrainingResult(scratch / "field", run.metrics)
+
+
+def _train(job: TileTraining, run: "Run", pools: "_Pools", log: "_Log") -> None:
+    """All steps that are left."""
+    settings, dynamic = job.settings.training, job.settings.features.dynamic_classes
     for step in range(run.step, settings.steps):
         pool, groups = pools.at(step)
-        batch = draw_static(
-            pool, settings.batch_rays, groups, _random(settings, step), job.settings.features.dynamic_classes
-        )
+        random = np.random.default_rng([settings.seed, step])
+        batch = draw_static(pool, settings.batch_rays, groups, random, dynamic)
         log.add(step, run.train(step, batch))
         if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
             log.flush(step)
             run.save(step + 1, log.figures)
-    checkpoint.save_field(scratch / "field", run.field)
-    return TrainingResult(scratch / "field", run.metrics)
 
 
 def training_rows(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.int64]:
@@ -133,10 +139,6 @@ def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.i
     """The rows in use, and which of them are held out."""
     rows = np.flatnonzero(frames.is_keyframe) if settings.keyframes_only else np.arange(len(frames))
     return rows, holdout_mask(frames.select(rows), settings.holdout_every)
-
-
-def _random(settings: TrainingSettings, step: int) -> np.random.Generator:
-    return np.random.default_rng([settings.seed, step])
 
 
 class _Pools:
@@ -291,6 +293,12 @@ class _Log:
         self._sums: dict[str, Tensor] = {}
         self._steps = 0
         self._started = time.perf_counter()
+
+    def __enter__(self) -> "_Log":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.close()
 
     def add(self, step: int, parts: dict[str, Tensor]) -> None:
         """Note a step's losses; every half second they are reported."""

@@ -78,7 +78,7 @@ def test_training_lowers_the_loss(tmp_path):
     overrides = ("training.steps=60", "training.checkpoint_every=10", "training.warmup=0.0")
     train_tile(tiny_job(*overrides), Gradient(), tmp_path, seen.append)
     assert seen[-1].done == seen[-1].total == 60
-    assert seen[-1].figures["loss"] < seen[0].figures["loss"] / 2
+    assert seen[-1].figures["loss"] < seen[1].figures["loss"] / 2  # the first report says only that it begins
     assert set(seen[-1].figures) == {"loss", "psnr_db", "rays_per_s"}
 
 
@@ -94,7 +94,7 @@ def test_an_interrupted_training_ends_as_an_uninterrupted_one(tmp_path):
         train_tile(job, Gradient(), tmp_path / "parts", interrupt)
     seen: list[Progress] = []
     resumed = train_tile(job, Gradient(), tmp_path / "parts", seen.append)
-    assert seen[0].done > 6
+    assert seen[0].done == 6
     expected = parameters_of(whole.folder)
     for name, parameter in parameters_of(resumed.folder).items():
         assert torch.equal(parameter, expected[name]), name
