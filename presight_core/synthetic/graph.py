@@ -163,12 +163,13 @@ def _resampled(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def follow(route: NDArray[np.float64], along_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Poses (T, 3), x, y, yaw, of a vehicle at distances along a route; it looks two metres ahead."""
-    index = np.arange(len(route)) * ROUTE_STEP_M
 
-    def point(distance: NDArray) -> NDArray:
-        return np.stack([np.interp(distance, index, route[:, axis]) for axis in (0, 1)], -1)
+    def point(distance_m: NDArray) -> NDArray:
+        before = np.minimum((distance_m / ROUTE_STEP_M).astype(np.int64), len(route) - 2)
+        share = (distance_m / ROUTE_STEP_M - before)[:, None]
+        return route[before] * (1 - share) + route[before + 1] * share
 
-    last = index[-1] - 2.0  # beyond, the look-ahead would shrink to nothing
-    along_m = np.clip(along_m, 0, last)
+    last_m = (len(route) - 1) * ROUTE_STEP_M - 2.0  # beyond, there is no place to look ahead to
+    along_m = np.clip(along_m, 0, last_m)
     ahead = point(along_m + 2.0) - point(along_m)
     return np.c_[point(along_m), np.arctan2(ahead[:, 1], ahead[:, 0])]

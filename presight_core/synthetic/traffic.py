@@ -52,7 +52,7 @@ class Traffic:
         moment = np.array([time_s])
         found = []
         for track in self.tracks:
-            x, y, yaw = track.poses(moment)[0].tolist()
+            x, y, yaw = (track.poses(moment) if track.is_moving else track.path)[0].tolist()
             if np.hypot(x - near[0], y - near[1]) < REACH_M:
                 found.append(Actor(track.kind, x, y, yaw, track.colour, track.instance))
         return found

@@ -1,0 +1,133 @@
+"""Rendered views: exact depth, consistent labels, reproducible pixels."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from presight_core.classes import CITYSCAPES, SKY
+from presight_core.frames import planar_transform
+from presight_core.synthetic.actors import FIRST_ACTOR, Actor
+from presight_core.synthetic.city import City
+from presight_core.synthetic.graph import follow
+from presight_core.synthetic.lighting import KINDS, sample_lighting
+from presight_core.synthetic.renderer import Renderer, Views
+from presight_core.synthetic.rig import RIG, rig_cameras
+from presight_core.synthetic.style import CityStyle
+from presight_core.synthetic.views import View, random_view
+
+WIDTH_PX = 96
+
+
+@pytest.fixture(scope="module")
+def city() -> City:
+    return City(seed=1, style=CityStyle(size_m=200.0, spacing_m=90.0))
+
+
+@pytest.fixture(scope="module")
+def view(city: City) -> View:
+    return random_view(city, np.random.default_rng(4), WIDTH_PX, "day")
+
+
+@pytest.fixture(scope="module")
+def views(city: City, view: View) -> Views:
+    return Renderer(city).render(view.cameras, view.lighting, view.actors)
+
+
+def nearest_hits(triangles: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Distances (R,) to the nearest triangle (F, 3, 3), infinite where none is hit: Moeller-Trumbore, ray by ray."""
+    a = triangles[:, 0] - origin
+    edge_b, edge_c = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    distances = []
+    for direction in directions:
+        p = np.cross(direction, edge_c)
+        determinant = np.einsum("fi,fi->f", edge_b, p)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.einsum("fi,fi->f", -a, p) / determinant
+            q = np.cross(-a, edge_b)
+            v = q @ direction / determinant
+            t = np.einsum("fi,fi->f", edge_c, q) / determinant
+        inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0.15) & np.isfinite(t)
+        distances.append(t[inside].min(initial=np.inf))
+    return np.array(distances)
+
+
+def test_depth_equals_ray_casting_through_pixel_centres(city: City, view: View):
+    views = Renderer(city).render(view.cameras, view.lighting)
+    triangles = city.mesh.vertices[city.mesh.faces].astype(np.float64)
+    rng = np.random.default_rng(0)
+    for number, camera in enumerate(view.cameras):
+        columns, rows = rng.integers(0, camera.width_px, 12), rng.integers(0, camera.height_px, 12)
+        pixels = np.stack([columns, rows], -1) + 0.5
+        origin, directions = camera.rays(pixels)
+        along_axis = directions @ camera.world_from_camera[:3, 2]
+        truth = nearest_hits(triangles, origin, directions) * along_axis
+        rendered = views.depth_m[number, rows, columns].astype(np.float64)
+        rendered[rendered == 0] = np.inf
+        np.testing.assert_allclose(rendered, truth, rtol=1e-4)
+
+
+def test_sky_is_where_depth_is_zero(views: Views):
+    np.testing.assert_array_equal(views.labels == SKY, views.depth_m == 0)
+    assert 0.02 < (views.labels == SKY).mean() < 0.9
+
+
+def test_only_actors_carry_dynamic_labels(views: Views):
+    dynamic = np.isin(
+        views.labels, [CITYSCAPES.index(n) for n in ("person", "rider", "car", "truck", "bus", "bicycle")]
+    )
+    np.testing.assert_array_equal(dynamic, views.instances >= FIRST_ACTOR)
+
+
+def test_same_seed_gives_the_same_bytes_in_any_number_of_threads(city: City, view: View, views: Views):
+    renderer = Renderer(city)
+    with ThreadPoolExecutor(4) as pool:
+        runs = list(pool.map(lambda _: renderer.render(view.cameras, view.lighting, view.actors), range(4)))
+    for run in runs:
+        for name in ("rgb", "depth_m", "labels", "instances"):
+            assert getattr(run, name).tobytes() == getattr(views, name).tobytes(), name
+
+
+def test_another_seed_changes_the_noise_and_nothing_else(city: City, view: View, views: Views):
+    other = Renderer(city).render(view.cameras, view.lighting, view.actors, seed=1)
+    assert not np.array_equal(other.rgb, views.rgb)
+    assert np.abs(other.rgb.astype(int) - views.rgb).mean() < 6  # grey levels
+    np.testing.assert_array_equal(other.depth_m, views.depth_m)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_light_is_neither_black_nor_burnt_out(city: City, view: View, kind: str):
+    lighting = sample_lighting(kind, np.random.default_rng(0))
+    rgb = Renderer(city).render(view.cameras, lighting, view.actors).rgb
+    assert 60 < rgb.mean() < 200
+    assert (rgb >= 250).mean() < 0.05
+
+
+def test_asphalt_carries_texture(city: City, view: View):
+    views = Renderer(city).render(view.cameras, view.lighting)
+    near_road = (views.labels == CITYSCAPES.index("road")) & (views.depth_m < 12)
+    grey = views.rgb.mean(-1)[near_road]
+    assert grey.std() > 6  # grey levels; sensor noise alone gives 3
+
+
+def test_a_car_in_front_hides_the_city_and_casts_a_shadow(city: City):
+    route = city.graph.route(city.graph.random_path(np.random.default_rng(0), 0, 3))
+    pose, ahead = follow(route, np.array([20.0, 32.0]))
+    world_from_ego = planar_transform(*pose)
+    camera = rig_cameras(world_from_ego, WIDTH_PX, WIDTH_PX * 9 // 16)[0]
+    lighting = sample_lighting("day", np.random.default_rng(0))
+    car = Actor("car", *ahead.tolist(), (0.7, 0.1, 0.1), FIRST_ACTOR)
+    renderer = Renderer(city)
+    without, with_car = renderer.render([camera], lighting), renderer.render([camera], lighting, [car])
+    on_car = with_car.instances == FIRST_ACTOR
+    assert on_car.sum() > 50
+    assert np.all(with_car.depth_m[on_car] < np.where(without.depth_m > 0, without.depth_m, np.inf)[on_car])
+    beside = ~on_car & (with_car.labels == without.labels)
+    darker = without.rgb.astype(int).mean(-1) - with_car.rgb.astype(int).mean(-1)
+    assert (darker[beside] > 15).sum() > 5
+
+
+def test_the_rig_looks_all_around():
+    headings = [np.arctan2(*(m.ego_from_camera[:2, 2][::-1])) for m in RIG]
+    gaps = np.diff(np.sort(np.rad2deg(headings)), append=np.rad2deg(min(headings)) + 360)
+    assert gaps.max() < 75  # the rear camera alone sees 89 degrees
