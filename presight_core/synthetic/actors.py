@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from presight_core.classes import CITYSCAPES
-from presight_core.synthetic.ground import height_m
+from presight_core.synthetic.ground import CURB_M, height_m
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, Mesh, cylinder, face_normals, sphere
 
 FIRST_ACTOR = 1_000_000  # instance numbers from here on are actors, below are parts of the city
-FOOT_M = 0.02  # wheels and shoes stand this far above the ground's triangles
+ROAD_M = 0.02  # wheels stand this far above the road, so that they never sink into its triangles
+SIDEWALK_M = CURB_M + 0.01  # likewise shoes
 PAINT = (-1.0, -1.0, -1.0)  # stands for the actor's own colour
 
 
@@ -26,6 +27,7 @@ class ActorKind:
     height_m: float
     category: str
     label: str
+    foot_m: float = ROAD_M  # above the road
 
 
 KINDS = {
@@ -34,13 +36,13 @@ KINDS = {
     "truck": ActorKind(7.6, 2.45, 3.25, "vehicle.truck", "truck"),
     "bus": ActorKind(11.6, 2.55, 3.3, "vehicle.bus.rigid", "bus"),
     "cyclist": ActorKind(1.75, 0.6, 1.75, "vehicle.bicycle", "bicycle"),
-    "pedestrian": ActorKind(0.6, 0.6, 1.78, "human.pedestrian.adult", "person"),
+    "pedestrian": ActorKind(0.6, 0.6, 1.78, "human.pedestrian.adult", "person", SIDEWALK_M),
 }
 
 
 @dataclass(frozen=True)
 class Actor:
-    """One road user at one moment, standing on the ground."""
+    """One road user at one moment: vehicles stand on the road, pedestrians on the sidewalk."""
 
     kind: str  # a key of KINDS
     x_m: float
@@ -102,12 +104,17 @@ def actor_mesh(actors: Sequence[Actor]) -> Mesh:
     )
 
 
+def foot_of(actor: Actor) -> NDArray[np.float64]:
+    """Where an actor stands (3,), world metres."""
+    ground_m = float(height_m(actor.x_m, actor.y_m))
+    return np.array([actor.x_m, actor.y_m, ground_m + KINDS[actor.kind].foot_m])
+
+
 def _placed(actor: Actor) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
     """Vertices in the world, faces, colours, materials and labels of one actor."""
     vertices, faces, materials, labels, colours, tints = _template(actor.kind)
     c, s = np.cos(actor.yaw_rad), np.sin(actor.yaw_rad)
-    foot = np.array([actor.x_m, actor.y_m, float(height_m(actor.x_m, actor.y_m)) + FOOT_M])
-    placed = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + foot
+    placed = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + foot_of(actor)
     return placed, faces, colours + tints * np.array(actor.colour), materials, labels
 
 

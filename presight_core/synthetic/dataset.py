@@ -23,7 +23,7 @@ from presight_core.cameras import Camera
 from presight_core.errors import SettingsError
 from presight_core.progress import Progress, Report, silent
 from presight_core.synthetic import nuscenes
-from presight_core.synthetic.actors import KINDS, Actor
+from presight_core.synthetic.actors import KINDS, Actor, foot_of
 from presight_core.synthetic.city import City
 from presight_core.synthetic.drive_plan import SWEEPS_A_KEYFRAME, DrivePlan, Shot, plan_drive
 from presight_core.synthetic.map_picture import write_map_picture
@@ -199,8 +199,7 @@ def _corners(actor: Actor) -> NDArray[np.float64]:
     signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (0.0, 1.0)])
     local = signs * [kind.length_m, kind.width_m, kind.height_m]
     c, s = np.cos(actor.yaw_rad), np.sin(actor.yaw_rad)
-    foot = np.array([actor.x_m, actor.y_m, City.height_m(actor.x_m, actor.y_m)])
-    return local @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + foot
+    return local @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + foot_of(actor)
 
 
 def _pixels_of(actors: Sequence[Actor], camera: Camera, instances: NDArray[np.int32]) -> dict[int, tuple[float, float]]:
@@ -243,12 +242,12 @@ def _boxes(
 
 def _box(actor: Actor, is_moving: bool, visible_share: float) -> nuscenes.Box:
     kind = KINDS[actor.kind]
-    foot_m = City.height_m(actor.x_m, actor.y_m)
+    x, y, foot_m = foot_of(actor).tolist()
     return nuscenes.Box(
         instance=actor.instance,
         category=kind.category,
         attribute=_attribute(kind.category, is_moving),
-        centre_m=(actor.x_m, actor.y_m, foot_m + kind.height_m / 2),
+        centre_m=(x, y, foot_m + kind.height_m / 2),
         size_m=(kind.width_m, kind.length_m, kind.height_m),
         yaw_rad=actor.yaw_rad,
         visible_share=visible_share,

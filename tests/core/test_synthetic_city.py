@@ -6,7 +6,7 @@ from shapely import Point
 from shapely.ops import unary_union
 
 from presight_core.classes import CITYSCAPES
-from presight_core.synthetic.actors import KINDS, Actor, actor_mesh
+from presight_core.synthetic.actors import KINDS, Actor, actor_mesh, foot_of
 from presight_core.synthetic.city import City
 from presight_core.synthetic.graph import ROUTE_STEP_M, follow
 from presight_core.synthetic.style import CityStyle
@@ -105,6 +105,12 @@ def test_actors_fill_the_box_that_annotations_give_them(kind: str):
     size = mesh.vertices.max(0) - mesh.vertices.min(0)
     box = [KINDS[kind].length_m, KINDS[kind].width_m, KINDS[kind].height_m]
     np.testing.assert_allclose(size, box, rtol=0.15)
+
+
+def test_vehicles_stand_on_the_road_and_pedestrians_on_the_sidewalk(city: City):
+    ground_m = city.height_m(50, 60)
+    feet_m = [foot_of(Actor(kind, 50, 60, 0, (0.5, 0.5, 0.5), 1_000_000))[2] for kind in ("car", "pedestrian")]
+    np.testing.assert_allclose(np.array(feet_m) - ground_m, [0.02, 0.16])
 
 
 def test_cyclists_carry_two_labels():
