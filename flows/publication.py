@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from typing import Any
 
-from stages.validation import validate_tile
-
 from flows.jobs import Job
 from flows.plan import CityPlan
 from presight_core.priors.documents import Generation, GenerationTile, TileEntry
+from stages.validation import validate_tile
 from storage.priors import PriorStore
 from storage.workspace import Workspace
 
@@ -40,11 +39,12 @@ def publish(
     """Publish what passes validation as one generation, and write every tile's end into the catalog."""
     store, catalog = workspace.store(), workspace.catalog()
     old = store.generation(plan.city)
-    accepted = []
+    accepted, errors = [], {tile_id: error for tile_id, (_, error) in failed.items()}
     for tile in built:
         problems = _problems(store, plan, tile, old)
         if problems:
-            failed[tile.job.tile_id] = (tile.job, "not published: " + "; ".join(problems))
+            errors[tile.job.tile_id] = "not published: " + "; ".join(problems)
+            catalog.finish_build(tile.job.build_id, "failed", tile.metrics, errors[tile.job.tile_id])
         else:
             accepted.append(tile)
     number = plan.generation
@@ -58,7 +58,7 @@ def publish(
     return {
         "generation": number,
         "published": [tile.job.tile_id for tile in accepted],
-        "failed": {tile_id: error for tile_id, (_, error) in failed.items()},
+        "failed": errors,
     }
 
 

@@ -32,6 +32,10 @@ batch_rays = 256
 [extraction]
 min_hits = 1
 min_density = 0.0
+max_depth_m = 900.0  # a field of so few steps is a fog with surfaces far away
+below_camera_m = 500.0
+above_camera_m = 500.0
+pixel_stride = 8
 [validation]
 min_voxels = 1
 min_psnr_db = 1.0
