@@ -6,32 +6,36 @@ from numpy.typing import NDArray
 
 from presight_core.classes import UNKNOWN
 
-CROP_HEIGHT_PX, CROP_WIDTH_PX = 224, 192  # half an image: twice as many different ones in a batch
-GREY_SHARE = 0.3  # of the samples: drives with grey cameras exist
+WHOLE_CROP_PX = 224, 192  # height, width: half an image, so that a batch holds twice as many different ones
+COARSE_CROP_PX = 112, 192  # nearly a whole image at half its scale
+STRETCHED_SHARE = 0.35  # of the samples; the others keep the scale at which the city is rendered
+FAULTY_SHARE = 0.35  # of the samples: with faults in all of them, cars took three times as long to be learned
+GREY_SHARE = 0.4  # of the faulty samples: drives with grey cameras exist
 
 
 def random_crop(
-    rgb: NDArray[np.uint8], labels: NDArray[np.uint8], rng: np.random.Generator
+    rgb: NDArray[np.uint8], labels: NDArray[np.uint8], size_px: tuple[int, int], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """A part of an image and of its label map, (224, 192), maybe mirrored, enlarged or stretched.
+    """A part of an image and of its label map, scaled to `size_px` (height, width), maybe mirrored or stretched.
 
     Stretched, because every image is brought to 16:9, whatever its own shape.
     """
     height, width = labels.shape
-    zoom_y = zoom_x = CROP_HEIGHT_PX / height
-    if rng.random() < 0.5:
+    crop_height, crop_width = size_px
+    zoom_y = zoom_x = crop_height / height
+    if rng.random() < STRETCHED_SHARE:
         zoom_y *= np.exp(rng.uniform(0.0, 0.5))
         zoom_x = zoom_y * np.exp(rng.uniform(-0.65, 0.2))  # -0.6 is what a panorama of 3.3:1 suffers
-    zoom_x = max(zoom_x, CROP_WIDTH_PX / width)
-    left = rng.uniform(0, width - CROP_WIDTH_PX / zoom_x)
-    top = rng.uniform(0, height - CROP_HEIGHT_PX / zoom_y)
+    zoom_x = max(zoom_x, crop_width / width)
+    left = rng.uniform(0, width - crop_width / zoom_x)
+    top = rng.uniform(0, height - crop_height / zoom_y)
     # Both grids have their first pixel's centre at 0.5, OpenCV's at 0.
     crop_from_image = np.array(
         [[zoom_x, 0, (0.5 - left) * zoom_x - 0.5], [0, zoom_y, (0.5 - top) * zoom_y - 0.5]], np.float64
     )
     if rng.random() < 0.5:
-        crop_from_image[0] = [-crop_from_image[0, 0], 0, CROP_WIDTH_PX - 1 - crop_from_image[0, 2]]
-    size = CROP_WIDTH_PX, CROP_HEIGHT_PX
+        crop_from_image[0] = [-crop_from_image[0, 0], 0, crop_width - 1 - crop_from_image[0, 2]]
+    size = crop_width, crop_height
     crop = cv2.warpAffine(rgb, crop_from_image, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     crop_labels = cv2.warpAffine(
         labels, crop_from_image, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN
@@ -42,7 +46,9 @@ def random_crop(
 def another_camera(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:
     """The image (H, W, 3) in 0..1 as another camera might have taken it: grey, off-colour, dark, blurred, noisy."""
     image: NDArray[np.floating] = rgb.astype(np.float32) / 255
-    if rng.random() < 0.3:
+    if rng.random() > FAULTY_SHARE:
+        return image.astype(np.float32, copy=False)
+    if rng.random() < 0.4:
         image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.3)).astype(np.float32)
     image = _recoloured(image, rng)
     if rng.random() < 0.8:

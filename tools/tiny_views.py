@@ -19,6 +19,7 @@ WIDTH_PX, HEIGHT_PX = 400, 225  # nuScenes' 16:9 at a quarter of its size
 CITY_M = 340.0  # about three blocks across: a minute's drive, built in under a second
 RIGS_PER_CITY = 8  # a new city costs as much as half a rig of six images
 FIRST_UNSEEN_SEED = 1_000_000  # cities from here on are for measuring only
+RARE_SHARE = 0.08  # of the cars; more, and cars are taken for buses
 EXTRA_INSTANCE = 500_000  # instance numbers of added actors follow the traffic's own
 
 Change = Callable[[View, np.random.Generator], View]
@@ -85,13 +86,15 @@ def _other_camera(camera: Camera, rng: np.random.Generator) -> Camera:
 
 
 def _busier(view: View, rng: np.random.Generator) -> tuple[Actor, ...]:
-    """The traffic with some cars made trucks, buses or cyclists, and people close by.
+    """The traffic with a few cars made trucks, buses or cyclists, and people close by.
 
     Ordinary traffic shows too few of these for a training of minutes.
     """
     rare = ("truck", "bus", "cyclist")
     actors = [
-        replace(actor, kind=str(rng.choice(rare))) if actor.kind in ("car", "van") and rng.random() < 0.25 else actor
+        replace(actor, kind=str(rng.choice(rare)))
+        if actor.kind in ("car", "van") and rng.random() < RARE_SHARE
+        else actor
         for actor in view.actors
     ]
     x, y = view.cameras[0].world_from_camera[:2, 3]
