@@ -16,7 +16,7 @@ from presight_core.config import load_city_settings
 from presight_core.recipes import Recipe
 from storage.workspace import Workspace
 
-CITY_ROW = "city"  # the catalog's row of what belongs to no tile: the feature space and the features
+CITY_ROW = "all tiles"  # the catalog's row of what belongs to no tile: the feature space and the features
 
 
 @flow(name="rebuild_city", flow_run_name="rebuild {city}", persist_result=False)

@@ -4,9 +4,17 @@ import time
 from pathlib import Path
 
 from flows.console import progress_bars
+from storage.workspace import Workspace
 
 CITY = "singapore-onenorth"  # official map names only, so that the official devkit can load the data set
 VERSION = "v1.0-mini"
+SETTINGS = """# Settings of the embedded city; see README, Settings.
+preset = "demo"
+
+[tiling]
+tile_count = 2 # one for each core; by its area alone the city would be one tile
+overlap_m = 15.0
+"""
 
 
 def generate_city(out: Path, preset: str, seed: int) -> None:
@@ -26,11 +34,20 @@ def run_demo(folder: Path, overrides: list[str]) -> None:
     from flows.status import show_status
 
     started = time.monotonic()
+    _write_settings(Workspace.open(folder))
     data = folder / "embedded-city"
     generate_city(data, "demo", seed=0)
     ingest_root(folder, data, VERSION, keep_going=False, as_json=False)
-    build_city(folder, CITY, ["preset=demo", *overrides], parallel=None, as_json=False)
+    build_city(folder, CITY, overrides, parallel=None, as_json=False)
     show_status(folder, CITY, as_json=False)
     page = write_report(folder, CITY, None)
     print(f"done in {time.monotonic() - started:.0f} s; look at {page}")
     print(f"ask it:  presight --workspace {folder} query {CITY} --at X,Y,YAW --png prior.png")
+
+
+def _write_settings(workspace: Workspace) -> None:
+    """Leave the demo's settings where every later command finds them; settings that are there stay."""
+    file = workspace.city_file(CITY)
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(SETTINGS, encoding="utf-8")

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flows.plan import city_frames
+from flows.jobs import recipe_from
+from flows.plan import city_frames, tile_frames
 from presight_core.config import load_city_settings
 from presight_core.maps import prior_picture, tile_map
 from presight_core.pictures import save_png
@@ -58,10 +59,8 @@ def _facts(workspace: Workspace, city: str, reader: PriorReader) -> str:
 def _tiles(workspace: Workspace, city: str, tiling: Tiling, out: Path) -> str:
     settings = load_city_settings(workspace.city_file(city))
     frames = city_frames(workspace.drives(), tuple(workspace.catalog().drives(city)), settings)
-    boxes = [
-        sub_fields(frames.positions[tiling.nearest(frames.positions) == index], settings.tiling)
-        for index, _ in enumerate(tiling.tiles)
-    ]
+    members = [tile_frames(frames, tiling, index, settings) for index in range(len(tiling.tiles))]
+    boxes = [sub_fields(rows.positions, settings.tiling) if len(rows) else () for rows in members]
     save_png(out / "tiles.png", tile_map(frames.positions, tiling, boxes))
     return _figure("tiles.png", "Camera positions, tiles and the sub-fields of each tile.")
 
@@ -83,8 +82,6 @@ def _birds_eye(workspace: Workspace, city: str, reader: PriorReader, out: Path) 
 def _rows(workspace: Workspace, city: str, reader: PriorReader, tile_id: str, out: Path) -> str:
     """Held-out pictures of one tile, copied beside the page."""
     training = reader.generation.tiles[tile_id].recipe["inputs"]["training"]
-    from flows.jobs import recipe_from
-
     source = workspace.scratch(city, tile_id, recipe_from(training).digest) / "pictures" / "rows.png"
     if not source.exists():
         return f"<p>{tile_id}: its pictures were cleared from the caches.</p>"

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from flows.console import print_json, print_table
 from presight_core.errors import NotFoundError
@@ -20,7 +21,7 @@ def show_status(folder: Path, city: str | None, as_json: bool) -> None:
     chosen = [city] if city else cities
     builds = {name: catalog.builds(name) for name in chosen}
     if as_json:
-        print_json({name: [asdict(build) for build in builds[name]] for name in chosen})
+        print_json({name: [_values(build) for build in builds[name]] for name in chosen})
         return
     rows = [_row(name, build) for name in chosen for build in builds[name]]
     if rows:
@@ -28,6 +29,11 @@ def show_status(folder: Path, city: str | None, as_json: bool) -> None:
     for name in chosen:
         if not builds[name]:
             print(f"{name}: ingested, nothing built yet; next: presight plan {name}")
+
+
+def _values(build: Build) -> dict[str, Any]:
+    """A build as JSON values; its recipe, which is long, by digest only."""
+    return {name: value for name, value in asdict(build).items() if name != "recipe"}
 
 
 def _row(city: str, build: Build) -> tuple[object, ...]:
