@@ -37,6 +37,10 @@ from torch.nn.functional import cross_entropy
 from presight_core.classes import UNKNOWN
 
 MEAN, STD = (0.45, 0.45, 0.45), (0.25, 0.25, 0.25)  # of street pictures, roughly; batch normalisation does the rest
+OUTPUTS = {  # name of the output, input pixels a cell, channels
+    "segmentation": ("logits", LOGIT_STRIDE, CLASS_COUNT),
+    "features": ("features", FEATURE_STRIDE, FEATURE_CHANNELS),
+}
 
 
 @dataclass(frozen=True)
@@ -124,40 +128,47 @@ def measure(network: TinyNetwork, views: LabelledImages) -> Scores:
     return scores(matrix, neighbours)
 
 
-def write_models(network: TinyNetwork, measured: Scores, recipe: Recipe, folder: Path) -> None:
+def write_models(network: TinyNetwork, note: str, folder: Path) -> None:
     """The ONNX pair and its cards."""
     folder.mkdir(parents=True, exist_ok=True)
-    for kind, output, stride, channels in (
-        ("segmentation", "logits", LOGIT_STRIDE, CLASS_COUNT),
-        ("features", "features", FEATURE_STRIDE, FEATURE_CHANNELS),
-    ):
+    for kind in OUTPUTS:
         file = folder / f"{kind}.onnx"
         export(network, kind, file)
-        note = (
-            "A stand-in for the demo and for tests: a small U-Net supervised on the procedural city's own classes "
-            f"for {recipe.steps} steps. It is not DINO or SegFormer; use such models for real drives: on photographs "
-            f"its labels are rough. {measured.summary()}"
-        )
-        card = {
-            "name": f"tiny-{kind}",
-            "kind": kind,
-            "file": file.name,
-            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "input": "image",
-            "input_height_px": INPUT_HEIGHT_PX,
-            "input_width_px": INPUT_WIDTH_PX,
-            "mean": list(MEAN),
-            "std": list(STD),
-            "output": output,
-            "layout": "NCHW",
-            "stride": stride,
-            "channels": channels,
-            "licence": "Apache-2.0",
-            "source": "tools/train_tiny_models.py of PreSight",
-            "note": note,
-        }
-        lines = [f"{key} = {json.dumps(value)}" for key, value in card.items()]  # JSON's values are TOML's here
-        (folder / f"{kind}.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_card(file, kind, note)
+
+
+def write_card(file: Path, kind: str, note: str) -> None:
+    """The model card beside an ONNX file."""
+    output, stride, channels = OUTPUTS[kind]
+    card = {
+        "name": f"tiny-{kind}",
+        "kind": kind,
+        "file": file.name,
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "input": "image",
+        "input_height_px": INPUT_HEIGHT_PX,
+        "input_width_px": INPUT_WIDTH_PX,
+        "mean": list(MEAN),
+        "std": list(STD),
+        "output": output,
+        "layout": "NCHW",
+        "stride": stride,
+        "channels": channels,
+        "licence": "Apache-2.0",
+        "source": "tools/train_tiny_models.py of PreSight",
+        "note": note,
+    }
+    lines = [f"{key} = {json.dumps(value)}" for key, value in card.items()]  # JSON's values are TOML's here
+    file.with_suffix(".toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def card_note(measured: Scores, steps: int) -> str:
+    """What the pair is, what it is not, and how good it is."""
+    return (
+        "A stand-in for the demo and for tests: a small U-Net supervised on the procedural city's own classes for "
+        f"{steps} steps. It is not DINO or SegFormer; use such models for real drives, because on photographs this "
+        f"one's labels are rough. {measured.summary()}"
+    )
 
 
 def rendered(parts: Iterator[LabelledImages], total: int, what: str, kept: Path | None) -> LabelledImages:
@@ -201,7 +212,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=Recipe.seed)
     parser.add_argument("--threads", type=int, default=Recipe.threads)
     parser.add_argument("--out", type=Path, default=Path("presight_core/models/tiny"), help="folder of the models")
-    parser.add_argument("--views", type=Path, help="folder to keep the rendered views in, for another training")
+    parser.add_argument(
+        "--views", type=Path, help="folder that keeps the views for other runs; empty it when the city changes"
+    )
     arguments = vars(parser.parse_args())
     folder, kept = arguments.pop("out"), arguments.pop("views")
     recipe = Recipe(**arguments)
@@ -220,7 +233,7 @@ def main() -> None:
     )
     measured = measure(network, unseen)
     print(measured.summary())
-    write_models(network, measured, recipe, folder)
+    write_models(network, card_note(measured, recipe.steps), folder)
 
 
 if __name__ == "__main__":
