@@ -89,6 +89,8 @@ class SamplingSettings(Settings):
     proposal_samples: tuple[Count, ...] = (128, 64)
     field_samples: Count = 64
     padding: Annotated[float, Field(ge=0)] = 0.01  # added to every proposal weight before sampling (released code)
+    floor_m: Metres | None = None  # rays end where no ground can be: this far below the camera; None: as the paper
+    floor_slope: Share = 0.1  # the floor falls away this steeply: the ground of the steepest street stays above it
 
 
 class LossSettings(Settings):

@@ -28,6 +28,18 @@ class Spacing:
         return spacing_from_metres(torch.as_tensor(metres, dtype=like.dtype, device=like.device), self.linear_m)
 
 
+def far_above_floor(
+    directions: Float[Tensor, "rays 3"], far_m: float, floor_m: float, slope: float
+) -> Float[Tensor, "rays 1"]:
+    """Metres along each ray to the floor, at most `far_m`.
+
+    The floor is a cone: `floor_m` below the ray's origin and falling by `slope` per horizontal metre. Asphalt has
+    so little texture that a field can explain it from any distance; a ray that ends here cannot let it sink.
+    """
+    descent = -directions[:, 2:] - slope * directions[:, :2].norm(dim=-1, keepdim=True)
+    return torch.where(descent > floor_m / far_m, floor_m / descent.clamp_min(floor_m / far_m), far_m)
+
+
 def spacing_from_metres(metres: Tensor, linear_m: float) -> Tensor:
     """The spacing function: linear up to `linear_m` (where it is 1/2), then in disparity, 1 at infinity."""
     return torch.where(metres < linear_m, metres / (2 * linear_m), 1 - linear_m / (2 * metres))

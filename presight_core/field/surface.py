@@ -72,7 +72,7 @@ def _surface_of_chunk(
 def _depth(field: TileField, rays: Rays, surface: str) -> tuple[Tensor, Tensor]:
     """Depth (R,) of the surface along each ray, and whether there is one."""
     _, edges = field.place_samples(rays, Sampling())
-    edges_m = field.spacing.metres(edges)
+    edges_m = field.spacing(rays).metres(edges)
     weights = rendering.ray_weights(field.density(rays.points(edges_m)), edges_m.diff(dim=-1))
     depth, found = rendering.first_hit_depth(weights, edges_m)
     if surface == "expected":

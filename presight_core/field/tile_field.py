@@ -151,7 +151,6 @@ class TileField(nn.Module):
         self.proposals = nn.ModuleList(
             DensityNetwork(grid, count, settings.proposal_width, 1) for grid in settings.proposals
         )
-        self.spacing = samplers.Spacing(shape.sampling.near_m, shape.sampling.far_m, shape.sampling.linear_m)
 
     def _place_sub_fields(self) -> None:
         corners = {
@@ -198,7 +197,7 @@ class TileField(nn.Module):
         """Render rays: sample, query, blend, and add the sky behind."""
         conditions = self.conditions(rays)
         proposals, edges = self.place_samples(rays, sampling)
-        edges_m = self.spacing.metres(edges)
+        edges_m = self.spacing(rays).metres(edges)
         values = self.query(rays.points(edges_m), conditions)
         weights = rendering.ray_weights(values.density, edges_m.diff(dim=-1))
         behind = 1 - weights.sum(-1, keepdim=True)
@@ -211,15 +210,23 @@ class TileField(nn.Module):
             proposals,
         )
 
+    def spacing(self, rays: Rays) -> samplers.Spacing:
+        """Where s lies in metres on each ray."""
+        settings = self.shape.sampling
+        far_m = settings.far_m
+        if settings.floor_m is not None:
+            far_m = samplers.far_above_floor(rays.directions, far_m, settings.floor_m, settings.floor_slope)
+        return samplers.Spacing(settings.near_m, far_m, settings.linear_m)
+
     def place_samples(
         self, rays: Rays, sampling: Sampling
     ) -> tuple[tuple[Histogram, ...], Float[Tensor, "rays edges"]]:
         """Histograms of the proposals, and the edges (in s) of the samples that they ask for."""
         counts = (*self.shape.sampling.proposal_samples, self.shape.sampling.field_samples)
         edges = samplers.uniform_edges(len(rays.origins), counts[0], self._jitter(rays, sampling), rays.origins)
-        histograms = []
+        histograms, spacing = [], self.spacing(rays)
         for proposal, count in zip(self.proposals, counts[1:], strict=True):
-            edges_m = self.spacing.metres(edges)
+            edges_m = spacing.metres(edges)
             with torch.set_grad_enabled(sampling.train_proposals and torch.is_grad_enabled()):
                 density = self._density(proposal, rays.points(edges_m))
                 weights = rendering.ray_weights(density, edges_m.diff(dim=-1))

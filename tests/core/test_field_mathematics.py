@@ -41,6 +41,22 @@ def test_spherical_harmonics_are_orthonormal():
     torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.03, rtol=0)  # sampling error
 
 
+def test_a_ray_ends_at_the_floor_and_only_there():
+    down, level, up = [0.6, 0.0, -0.8], [1.0, 0.0, 0.0], [0.6, 0.0, 0.8]
+    directions = torch.tensor([down, level, up])
+    far = samplers.far_above_floor(directions, far_m=1000.0, floor_m=4.0, slope=0.1)
+    end = far[0] * directions[0]
+    torch.testing.assert_close(end[2], -(4.0 + 0.1 * end[0]))
+    assert far[1:].flatten().tolist() == [1000.0, 1000.0]
+
+
+def test_no_ray_ends_beyond_the_far_plane():
+    directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    far = samplers.far_above_floor(directions, far_m=100.0, floor_m=4.0, slope=0.1)
+    assert far.max() == 100.0
+    assert far.min() >= 4.0 / 1.1
+
+
 def test_spacing_and_metres_are_inverses():
     metres = torch.tensor([0.5, 50.0, 99.0, 101.0, 900.0], dtype=torch.float64)
     torch.testing.assert_close(samplers.metres_from_spacing(samplers.spacing_from_metres(metres, 100), 100), metres)
