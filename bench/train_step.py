@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def measure(run: Run, job: TileTraining, steps: int) -> dict[str, float | int | str]:
-    """Medians of whole steps: milliseconds of wall and processor time, and rays a second of each."""
+    """Means of whole steps, the slowest tenth left out: milliseconds of wall and processor time, and rays a second."""
     watch = Stopwatch()
     first = job.settings.training.steps // 2  # past the warm-up, where the proposals learn every fifth step
     for step in range(first, first + WARM_UP + steps):
