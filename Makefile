@@ -1,4 +1,5 @@
 # One environment (.venv), made on demand. `make install TORCH=` keeps the torch that is already in it.
+# Modules are compiled when they are first imported: most of what is installed never is.
 PYTHON ?= python3.11
 TORCH ?= torch==2.13.0
 BIN = .venv/bin
@@ -9,8 +10,8 @@ install: .venv/.installed
 
 .venv/.installed: pyproject.toml constraints-cpu.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(if $(TORCH),$(BIN)/pip install --quiet '$(TORCH)',$(BIN)/python -c 'import torch')
-	$(BIN)/pip install --quiet $(if $(TORCH),-c constraints-cpu.txt) -e '.[pipeline,dev]'
+	$(if $(TORCH),$(BIN)/pip install --quiet --no-compile '$(TORCH)',$(BIN)/python -c 'import torch')
+	$(BIN)/pip install --quiet --no-compile $(if $(TORCH),-c constraints-cpu.txt) -e '.[pipeline,dev]'
 	touch $@
 
 demo: install
