@@ -21,9 +21,9 @@ from presight_core.pixels import PixelSource
 from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import Recipe
 from presight_core.tiles import SubField
+from stages import versions
 from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
 
-VERSION = 1  # raised whenever the same inputs give another field
 REPORT_SECONDS = 0.5
 POOL_BYTES = 3 << 30  # of decoded images in memory
 POOL_STEPS = 250  # a pool that cannot hold all images is drawn anew this often (released code: about 280)
@@ -56,7 +56,7 @@ class TileTraining:
             "dynamic_classes": list(self.settings.features.dynamic_classes),
         }
         settings = {name: getattr(self.settings, name).model_dump(mode="json") for name in chosen}
-        return Recipe("training", VERSION, settings, inputs)
+        return Recipe("training", versions.TRAINING, settings, inputs)
 
 
 @dataclass(frozen=True)
