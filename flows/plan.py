@@ -25,7 +25,7 @@ from storage.workspace import Workspace
 
 MIN_FRAMES = 8  # fewer images than this cannot constrain a field; the tile is left out and said so
 PLAN_COLUMNS = ("tile", "drives", "frames", "state", "why", "last build")
-BYTES_PER_VOXEL = 80  # the store's upper bound (design: prior store), for the disk estimate
+BYTES_PER_VOXEL = 80  # the format's upper bound at 64 channels, for the disk estimate
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ class FieldSettings(Settings):
     geometry_channels: Count = 15
     video_embedding: Count = 12
     image_embedding: Annotated[int, Field(ge=0)] = 4
-    density_bias: float = -4.0  # metres; the released code's poses are scaled by 0.05 (findings B)
+    density_bias: float = -4.0  # metres; the released code, whose poses are scaled by 0.05, needs none
 
 
 class SamplingSettings(Settings):
