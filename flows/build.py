@@ -1,10 +1,11 @@
 """`presight build`: plan, and run the flow only if something is stale."""
 
 import os
+import signal
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from flows.console import print_json
 from flows.plan import CityPlan, plan_city
@@ -47,9 +48,14 @@ def _run(workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: i
     from flows.city import run_city
     from flows.display import watch_builds
 
+    signal.signal(signal.SIGTERM, _exit)  # so that Prefect's embedded server ends with us
     print(f"{plan.city}: starting the flow", file=sys.stderr)
     with watch_builds(workspace.catalog(), plan.city):
         return run_city(workspace, plan, overrides, parallel)
+
+
+def _exit(number: int, _frame: Any) -> NoReturn:
+    sys.exit(128 + number)
 
 
 def _print(city: str, outcome: dict[str, Any]) -> None:
