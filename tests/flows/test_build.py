@@ -73,13 +73,13 @@ def test_one_generation_shows_every_tile(built):
     assert all(tile.entry.voxel_count > 0 for tile in generation.tiles.values())
 
 
-def test_the_reader_finds_voxels_where_the_cameras_drove(built):
-    position = built.drives().frames(built.catalog().drives(CITY)[0].drive_id).positions.mean(0)
+def test_the_reader_sees_the_streets_that_were_driven_and_finds_every_voxel(built):
     world_from_ego = np.eye(4)
-    world_from_ego[:3, 3] = position
-    window = PriorReader.open(built.store_location, CITY).window(world_from_ego, z_m=(-10, 10))
-    assert len(window) > 0
-    assert window.observed.any()
+    world_from_ego[:3, 3] = built.drives().frames(built.catalog().drives(CITY)[0].drive_id).positions.mean(0)
+    reader = PriorReader.open(built.store_location, CITY, generation=1)
+    assert reader.window(world_from_ego, (-5, 5), (-5, 5)).coverage > 0.9
+    everything = reader.window(world_from_ego, (-2000, 2000), (-2000, 2000), (-600, 600))
+    assert len(everything) == sum(tile.entry.voxel_count for tile in reader.generation.tiles.values())
 
 
 def test_tiles_share_no_voxel(built):
