@@ -2,11 +2,11 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
-from presight_core.errors import PresightError
+from presight_core.errors import MissingDependencyError, PresightError
 
 app = typer.Typer(
     help="Turn the camera logs of past drives into a city's neural prior.",
@@ -157,8 +157,15 @@ def main() -> None:
     try:
         app()
     except PresightError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        _fail(error)
+    except ModuleNotFoundError as error:
+        cure = "this command needs the whole pipeline: pip install '.[pipeline]' (README, Install)"
+        _fail(MissingDependencyError(f"{error}; {cure}"))
+
+
+def _fail(error: PresightError) -> NoReturn:
+    print(f"error: {error}", file=sys.stderr)
+    sys.exit(error.exit_code)
 
 
 if __name__ == "__main__":

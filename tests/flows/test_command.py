@@ -1,6 +1,8 @@
 """The `presight` command as a user meets it: one clear line, a telling exit code, nothing half done."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +134,16 @@ def test_a_workspace_that_is_not_one_is_named_and_not_made(tmp_path, presight):
     assert result.returncode == 2
     assert "presight ingest" in result.stderr
     assert not (tmp_path / "nowhere").exists()
+
+
+def test_without_the_pipelines_packages_a_command_says_what_to_install(workspace):
+    code = "import sys; sys.modules['pyarrow'] = None; from flows.cli import main; main()"
+    command = [sys.executable, "-c", code, "--workspace", str(workspace), "plan", "toytown"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 3
+    assert "pyarrow" in result.stderr
+    assert "pip install" in result.stderr
+    assert "Traceback" not in result.stderr
 
 
 def test_a_plan_names_the_tiles_and_why_they_are_stale(workspace, presight):
