@@ -8,7 +8,8 @@ import numpy as np
 
 from flows.jobs import recipe_from
 from flows.plan import city_frames, tile_frames
-from presight_core.config import load_city_settings
+from presight_core.config import CitySettings, load_city_settings
+from presight_core.drives import FrameTable
 from presight_core.maps import prior_picture, tile_map
 from presight_core.pictures import save_png
 from presight_core.priors.reader import PriorReader
@@ -33,10 +34,12 @@ def write_report(folder: Path, city: str, out: Path | None) -> Path:
     out = out or workspace.root / "reports" / city
     out.mkdir(parents=True, exist_ok=True)
     reader = PriorReader.open(workspace.store_location, city)
+    settings = load_city_settings(workspace.city_file(city))
+    frames = city_frames(workspace.drives(), tuple(workspace.catalog().drives(city)), settings)
     sections = [
         _facts(workspace, city, reader),
-        _tiles(workspace, city, Tiling.from_json(reader.generation.tiling), out),
-        _birds_eye(workspace, city, reader, out),
+        _tiles(frames, settings, Tiling.from_json(reader.generation.tiling), out),
+        _birds_eye(frames, reader, out),
         *(_rows(workspace, city, reader, tile_id, out) for tile_id in reader.tiles),
     ]
     page = out / "index.html"
@@ -56,19 +59,15 @@ def _facts(workspace: Workspace, city: str, reader: PriorReader) -> str:
     return head + _table(rows) + _table(drive_rows)
 
 
-def _tiles(workspace: Workspace, city: str, tiling: Tiling, out: Path) -> str:
-    settings = load_city_settings(workspace.city_file(city))
-    frames = city_frames(workspace.drives(), tuple(workspace.catalog().drives(city)), settings)
+def _tiles(frames: FrameTable, settings: CitySettings, tiling: Tiling, out: Path) -> str:
     members = [tile_frames(frames, tiling, index, settings) for index in range(len(tiling.tiles))]
     boxes = [sub_fields(rows.positions, settings.tiling) if len(rows) else () for rows in members]
     save_png(out / "tiles.png", tile_map(frames.positions, tiling, boxes))
     return _figure("tiles.png", "Camera positions, tiles and the sub-fields of each tile.")
 
 
-def _birds_eye(workspace: Workspace, city: str, reader: PriorReader, out: Path) -> str:
+def _birds_eye(frames: FrameTable, reader: PriorReader, out: Path) -> str:
     """The prior around the middle of the city, as wide as a picture can show."""
-    settings = load_city_settings(workspace.city_file(city))
-    frames = city_frames(workspace.drives(), tuple(workspace.catalog().drives(city)), settings)
     low, high = frames.positions[:, :2].min(0) - MARGIN_M, frames.positions[:, :2].max(0) + MARGIN_M
     centre, half = (low + high) / 2, np.minimum((high - low) / 2, WIDEST_M / 2)
     world_from_view = np.eye(4)

@@ -17,6 +17,7 @@ from pyarrow import parquet
 
 from presight_core.drives import Drive, FrameTable, Reject
 from presight_core.errors import NotFoundError, StoreError
+from storage.folders import force_to_disk
 
 FORMAT = 1  # of the columns and metadata below
 METADATA_KEY = b"presight"
@@ -137,13 +138,4 @@ def _write_whole(table: pa.Table, file: Path) -> None:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
-    _force_to_disk(file.parent)
-
-
-def _force_to_disk(folder: Path) -> None:
-    """Make a rename in the folder survive a loss of power."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    force_to_disk(file.parent)

@@ -19,9 +19,9 @@ def whole_folder(final: Path) -> Iterator[Path]:
     temporary.mkdir()
     try:
         yield temporary
-        _force_to_disk(temporary)
+        _force_tree_to_disk(temporary)
         _rename(temporary, final)
-        _force_entry_to_disk(final.parent)
+        force_to_disk(final.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -34,14 +34,15 @@ def _rename(temporary: Path, final: Path) -> None:
             raise
 
 
-def _force_to_disk(folder: Path) -> None:
+def _force_tree_to_disk(folder: Path) -> None:
     """Make all files of a folder survive a loss of power, before its rename can."""
     for parent, _, files in os.walk(folder):
         for name in [*files, ""]:  # "" is the folder's own list of names
-            _force_entry_to_disk(Path(parent) / name)
+            force_to_disk(Path(parent) / name)
 
 
-def _force_entry_to_disk(path: Path) -> None:
+def force_to_disk(path: Path) -> None:
+    """Make a file's content, or a folder's list of names, survive a loss of power."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
