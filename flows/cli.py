@@ -128,12 +128,13 @@ def report(
 def synth(
     out: Annotated[Path, typer.Argument(help="Folder of the new data set.", show_default=False)],
     preset: Annotated[str, typer.Option(help="ci, demo or experiment.")] = "demo",
-    seed: Annotated[int, typer.Option(help="Seed: the same seed gives the same city.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed: the same seed gives the same city.")] = 0,
+    override: Overrides = None,
 ) -> None:
     """Generate the embedded city: a procedural data set in nuScenes format with ground truth."""
     from flows.demo import generate_city
 
-    generate_city(out, preset, seed)
+    generate_city(out, preset, seed, override or [])
 
 
 @app.command()

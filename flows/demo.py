@@ -17,13 +17,14 @@ overlap_m = 15.0
 """
 
 
-def generate_city(out: Path, preset: str, seed: int) -> None:
+def generate_city(out: Path, name: str, seed: int, overrides: list[str]) -> None:
     """Write the embedded city to `out`, going on where an earlier call was interrupted."""
-    from presight_core.synthetic import write_dataset
+    from presight_core.synthetic import load_preset, write_dataset
 
+    preset = load_preset(name, overrides)
     with progress_bars() as report:
         write_dataset(out, preset, seed, report)
-    print(f"{out}: a city in nuScenes format; next: presight ingest {out} --version {VERSION}")
+    print(f"{out}: {', '.join(preset.towns)} in nuScenes format; next: presight ingest {out} --version {preset.version}")
 
 
 def run_demo(folder: Path, overrides: list[str]) -> None:
@@ -36,7 +37,7 @@ def run_demo(folder: Path, overrides: list[str]) -> None:
     started = time.monotonic()
     _write_settings(Workspace.open(folder))
     data = folder / "embedded-city"
-    generate_city(data, "demo", seed=0)
+    generate_city(data, "demo", seed=0, overrides=[])
     ingest_root(folder, data, VERSION, keep_going=False, as_json=False)
     build_city(folder, CITY, overrides, parallel=None, as_json=False)
     show_status(folder, CITY, as_json=False)

@@ -175,13 +175,13 @@ def load_city_settings(file: Path | None, overrides: Iterable[str] = ()) -> City
     """
     chosen = read_toml(file) if file is not None and file.exists() else {}
     source = str(file) if chosen else "the defaults"
-    for override in overrides:
-        _set(chosen, override)
+    if overrides := list(overrides):
+        chosen = merge(chosen, parse_overrides(overrides))
         source = f"{source} with --set"
     preset = chosen.get("preset", "default")
     if preset not in PRESETS:
         raise SettingsError(f"{source}: preset: {preset!r} is unknown; choose one of {', '.join(PRESETS)}")
-    return validate(CitySettings, _merge(_preset(preset), chosen), source)
+    return validate(CitySettings, merge(_preset(preset), chosen), source)
 
 
 def load_workspace_settings(file: Path) -> WorkspaceSettings:
@@ -211,12 +211,21 @@ def _preset(name: str) -> dict[str, Any]:
     return tomllib.loads(text)
 
 
-def _merge(base: dict[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings with those of `top` laid over those of `base`."""
     merged = dict(base)
     for key, value in top.items():
         below = merged.get(key)
-        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
+        merged[key] = merge(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
     return merged
+
+
+def parse_overrides(overrides: Iterable[str]) -> dict[str, Any]:
+    """Nested settings of `a.b=value` texts. Raises SettingsError for a text that says nothing, or two things."""
+    values: dict[str, Any] = {}
+    for override in overrides:
+        _set(values, override)
+    return values
 
 
 def _set(values: dict[str, Any], override: str) -> None:

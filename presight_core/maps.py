@@ -73,7 +73,7 @@ def prior_picture(window: "Window", x_m: Range, y_m: Range, voxel_m: float) -> R
     panels = {
         "colour": window.rgb,
         "features, first three channels": feature_image(_stretched(window.features[:, :3])),
-        f"height, {low[0]:.1f} m (blue) to {high[0]:.1f} m (red)": _height_colours(window.points_ego[:, 2:]),
+        f"height, {low[0]:.1f} m (blue) to {high[0]:.1f} m (red)": height_colours(window.points_ego[:, 2:]),
     }
     drawn = [birds_eye(window.points_ego, colours, view, FOOTPRINT * voxel_m) for colours in panels.values()]
     return stack_rows([drawn], list(panels))
@@ -156,7 +156,8 @@ def _stretched(values: NDArray) -> NDArray[np.float64]:
     return np.clip((values - low) / (high - low), 0, 1)
 
 
-def _height_colours(heights_m: NDArray) -> NDArray[np.uint8]:
+def height_colours(heights_m: NDArray) -> NDArray[np.uint8]:
+    """Colours (N, 3) of heights (N, 1): turbo from the lowest (blue) to the highest (red), strays apart."""
     from matplotlib import colormaps
 
     return colormaps["turbo"](_stretched(heights_m)[:, 0], bytes=True)[:, :3]

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from presight_core.progress import Report, silent
-from presight_core.synthetic.presets import PRESETS, SynthPreset
+from presight_core.synthetic.presets import PRESETS, SynthPreset, load_preset
 
-__all__ = ["PRESETS", "SynthPreset", "write_dataset"]
+__all__ = ["PRESETS", "SynthPreset", "load_preset", "write_dataset"]
 
 
 def write_dataset(

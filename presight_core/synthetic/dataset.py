@@ -1,41 +1,42 @@
-"""Write a data set: drives through one synthetic city in the nuScenes format, with ground truth beside it.
+"""Write a data set: drives through synthetic cities in the nuScenes format, with ground truth beside it.
 
-root/samples, root/sweeps, root/maps, root/v1.0-mini    what nuScenes has
+root/samples, root/sweeps, root/maps, root/<version>    what nuScenes has
+root/maps/expansion/<location>.json                     the vector map
+root/gts/<scene>/<sample token>/labels.npz              occupancy, laid out as Occ3D has it
 root/synth_gt/<scene>/<timestamp>_<camera>.npz          depth, labels, instances of each keyframe image
 root/synth_gt/<scene>/rows.json                         that drive's table rows: written last, so it is complete
+root/synth_gt/surface/<location>.npz                    a dense point set of the standing city
 root/synth_gt/synth.json                                what the data set was made from
 """
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import get_args
 
-import cv2
-import numpy as np
-import shapely
-from numpy.typing import NDArray
-
-from presight_core.cameras import Camera
 from presight_core.errors import SettingsError
 from presight_core.progress import Progress, Report, silent
 from presight_core.synthetic import nuscenes
-from presight_core.synthetic.actors import KINDS, Actor, foot_of
+from presight_core.synthetic.annotations import Sightings, boxes_of
 from presight_core.synthetic.city import City
-from presight_core.synthetic.drive_plan import SWEEPS_A_KEYFRAME, DrivePlan, Shot, plan_drive
+from presight_core.synthetic.drive_plan import DrivePlan, Shot, Stretch, Turn, plan_drive, plan_streets
+from presight_core.synthetic.files import write_json
+from presight_core.synthetic.map_expansion import write_map_expansion
 from presight_core.synthetic.map_picture import write_map_picture
 from presight_core.synthetic.nuscenes import Rows
-from presight_core.synthetic.presets import PRESETS, SynthPreset
-from presight_core.synthetic.renderer import Renderer, Views
-from presight_core.synthetic.rig import rig_camera
-from presight_core.synthetic.shadow import Shadows
+from presight_core.synthetic.presets import DriveOrder, Location, SynthPreset, load_preset
+from presight_core.synthetic.raycast import RayCaster
+from presight_core.synthetic.renderer import Renderer
+from presight_core.synthetic.rig import RIG
+from presight_core.synthetic.shooting import Shooting
+from presight_core.synthetic.surface_points import sample_surface, write_surface
 
-FORMAT = 1  # raise it when the same preset and seed would give other files
-LOCATIONS = ("boston-seaport", "singapore-hollandvillage", "singapore-onenorth", "singapore-queenstown")
-ANNOTATED_M = 60.0  # objects farther from the car than this get no box
+FORMAT = 2  # raise it when the same preset and seed would give other files
 SHADOW_MARGIN_M = 130.0  # past the ends of a drive
 
 
@@ -45,218 +46,128 @@ def write_dataset(
     """Write the data set of a preset (or the name of one in PRESETS) and a seed into a folder.
 
     Drives that are already complete are kept, so an interrupted run is finished by running it again.
-    Raises SettingsError for an unknown preset or location, and if the folder holds another data set.
+    Raises SettingsError for an unknown preset, and if the folder holds another data set.
     """
-    preset = _resolve(preset)
+    preset = load_preset(preset) if isinstance(preset, str) else preset
     _claim(root, preset, seed)
-    total = len(preset.lights) * preset.moments
-    work = _Work(root, preset, seed, threads or os.cpu_count() or 1)
-    for number in range(len(preset.lights)):
-        if not work.is_complete(number):
-            work.write_drive(number, lambda done, base=number * preset.moments: _tell(report, base + done, total))
-        _tell(report, (number + 1) * preset.moments, total)
-    work.write_tables()
+    total = len(preset.drives) * preset.moments
+    done = 0
 
+    def tell(moments: int) -> None:
+        report(Progress("synth", done + moments, total))
 
-def _tell(report: Report, done: int, total: int) -> None:
-    report(Progress("synth", done, total))
-
-
-def _resolve(preset: SynthPreset | str) -> SynthPreset:
-    if isinstance(preset, str):
-        if preset not in PRESETS:
-            raise SettingsError(f"preset {preset!r} is unknown; choose one of {', '.join(PRESETS)}")
-        preset = PRESETS[preset]
-    if preset.location not in LOCATIONS:
-        raise SettingsError(
-            f"location {preset.location!r} is unknown to nuScenes; choose one of {', '.join(LOCATIONS)}"
-        )
-    return preset
+    for location in preset.towns:
+        town = _TownWork(root, preset, location, seed, threads or os.cpu_count() or 1)
+        for order in (order for order in preset.drives if order.location == location):
+            if not town.is_complete(order):
+                town.write_drive(order, tell)
+            done += preset.moments
+            tell(0)
+        town.write_maps()
+    _write_tables(root, preset)
 
 
 def _claim(root: Path, preset: SynthPreset, seed: int) -> None:
     """Note what the folder is for, or refuse it if it is for something else."""
-    wanted = json.loads(json.dumps({"format": FORMAT, "seed": seed, "preset": asdict(preset)}))
+    wanted = {"format": FORMAT, "seed": seed, "preset": preset.model_dump(mode="json")}
     stamp = root / "synth_gt" / "synth.json"
     if not stamp.exists():
-        nuscenes.write_json(stamp, wanted)
+        write_json(stamp, wanted)
         return
     found = json.loads(stamp.read_text(encoding="utf-8"))
     if found != wanted:
         made = f"preset {found.get('preset', {}).get('name')!r}, seed {found.get('seed')}, format {found.get('format')}"
         raise SettingsError(
             f"{root} holds another synthetic data set ({made}; wanted preset {preset.name!r}, seed {seed}, "
-            f"format {FORMAT}); choose another folder, or delete this one"
+            f"format {FORMAT}, perhaps with other settings); choose another folder, or delete this one"
         )
 
 
-@dataclass(frozen=True)
-class _Shooting:
-    """One drive while it is rendered."""
-
-    plan: DrivePlan
-    shadows: Shadows
-    root: Path
-    preset: SynthPreset
-    renderer: Renderer
-
-    def take(self, shot: Shot) -> dict[int, tuple[float, float]]:
-        """Render and write one image; returns pixels seen and pixels expected of each object in a keyframe."""
-        plan, preset = self.plan, self.preset
-        x, y, _ = plan.pose(shot.time_s).tolist()
-        world_from_ego = plan.world_from_ego(shot.time_s)
-        world_from_ego[2, 3] = City.height_m(x, y)  # the car follows the ground, its recorded pose does not
-        camera = rig_camera(shot.mount, world_from_ego, preset.width_px, preset.height_px)
-        actors = plan.traffic.actors(shot.time_s, np.array([x, y]))
-        seed = (plan.noise_seed + 7919 * shot.moment + 101 * shot.mount.delay_us) % 2**31  # another grain each time
-        views = self.renderer.render([camera], plan.lighting, actors, self.shadows, seed)
-        self._write_image(shot, views)
-        if not shot.is_keyframe:
-            return {}
-        self._write_truth(shot, views)
-        return _pixels_of(actors, camera, views.instances[0])
-
-    def _write_image(self, shot: Shot, views: Views) -> None:
-        path = self.root / nuscenes.image_path(self.plan, shot)
-        bgr = np.ascontiguousarray(views.rgb[0][..., ::-1])
-        encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self.preset.jpeg_quality])[1]
-        path.write_bytes(encoded.tobytes())
-
-    def _write_truth(self, shot: Shot, views: Views) -> None:
-        """Depth in half precision: 0.05 % of the depth, a tenth of what any method here resolves."""
-        np.savez_compressed(
-            self.root / nuscenes.truth_path(self.plan, shot),
-            depth=views.depth_m[0].astype(np.float16),
-            labels=views.labels[0],
-            instances=views.instances[0],
-        )
+def _rows_file(root: Path, scene: str) -> Path:
+    return root / "synth_gt" / scene / "rows.json"
 
 
 @dataclass
-class _Work:
-    """A data set in the making; the city is built only if something is left to do."""
+class _TownWork:
+    """One city of a data set in the making; it is built only if something is left to do."""
 
     root: Path
     preset: SynthPreset
+    location: Location
     seed: int
     threads: int
 
     @cached_property
     def city(self) -> City:
-        return City(self.seed, self.preset.style)
+        locations = get_args(Location)
+        return City(self.seed * len(locations) + locations.index(self.location), self.preset.towns[self.location].style)
+
+    @cached_property
+    def streets(self) -> tuple[Stretch, ...]:
+        return plan_streets(self.city, self.preset.towns[self.location], self.preset.keyframes)
 
     @cached_property
     def renderer(self) -> Renderer:
-        return Renderer(self.city)
+        return Renderer(self.city, self.preset.antialias)
 
-    def _rows_file(self, number: int) -> Path:
-        return self.root / "synth_gt" / f"scene-{number + 1:04d}" / "rows.json"
+    @cached_property
+    def caster(self) -> RayCaster:
+        return RayCaster(self.city.mesh)
 
-    def is_complete(self, number: int) -> bool:
-        return self._rows_file(number).exists()
+    def is_complete(self, order: DriveOrder) -> bool:
+        return _rows_file(self.root, order.scene).exists()
 
-    def write_drive(self, number: int, report_moments: Callable[[int], None]) -> None:
-        """Render all images of a drive side by side, then write its rows."""
-        plan = plan_drive(self.city, self.preset, self.seed, number)
-        shots = plan.shots(self.preset.sweeps)
-        for path in {nuscenes.image_path(plan, shot) for shot in shots} | {nuscenes.truth_path(plan, shots[0])}:
+    def write_drive(self, order: DriveOrder, tell: Callable[[int], None]) -> None:
+        """Take everything of a drive side by side, then write its rows."""
+        preset = self.preset
+        plan = plan_drive(self.city, preset, self.streets, order)
+        shots, turns = plan.shots(preset.sweeps), plan.turns(preset.sweeps and preset.lidar)
+        size_px = preset.width_px, preset.height_px
+        files = nuscenes.recordings(plan, shots, turns if preset.lidar else [], size_px)
+        for path in {file.path for file in files} | {nuscenes.truth_path(plan, shots[0])}:
             (self.root / path).parent.mkdir(parents=True, exist_ok=True)
+        sightings = self._take(plan, shots, turns, tell)
+        boxes = {keyframe: boxes_of(plan, keyframe, sightings[keyframe]) for keyframe in range(plan.keyframes)}
+        write_json(_rows_file(self.root, order.scene), nuscenes.drive_rows(plan, files, size_px, boxes))
+
+    def _take(
+        self, plan: DrivePlan, shots: list[Shot], turns: list[Turn], tell: Callable[[int], None]
+    ) -> dict[int, Sightings]:
+        """Everything of a drive, in order of time; returns what the sensors saw at each keyframe."""
         shadows = self.renderer.cast_shadows(plan.lighting, plan.middle, plan.reach_m + SHADOW_MARGIN_M)
-        shooting = _Shooting(plan, shadows, self.root, self.preset, self.renderer)
-        seen = []
+        shooting = Shooting(plan, self.preset, self.root, self.renderer, shadows, self.caster)
+        events: list[Shot | Turn] = sorted([*shots, *turns], key=lambda event: event.timestamp_us)
+        seen: dict[int, Sightings] = defaultdict(Sightings)
+        images = 0
         with ThreadPoolExecutor(self.threads) as pool:
             try:
-                for done, pixels in enumerate(pool.map(shooting.take, shots), 1):
-                    seen.append(pixels)
-                    report_moments(done // len(nuscenes.RIG))
+                for event, sightings in zip(events, pool.map(shooting.take, events), strict=True):
+                    seen[event.keyframe].add(sightings)
+                    images += isinstance(event, Shot)
+                    tell(images // len(RIG))
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-        size_px = self.preset.width_px, self.preset.height_px
-        boxes = _boxes(plan, shots, seen)
-        nuscenes.write_json(
-            self._rows_file(number), nuscenes.drive_rows(plan, self.preset.location, size_px, shots, boxes)
-        )
+        return seen
 
-    def write_tables(self) -> None:
-        """Join the rows of all drives into the tables, and draw the map."""
-        numbers = range(len(self.preset.lights))
-        drives: list[Rows] = [json.loads(self._rows_file(number).read_text(encoding="utf-8")) for number in numbers]
-        rows = nuscenes.merge([nuscenes.vocabulary_rows(), *drives])
-        rows["map"] = [nuscenes.map_row(self.preset.location, rows["log"])]
-        picture = self.root / rows["map"][0]["filename"]
+    def write_maps(self) -> None:
+        """The city's map as picture and vectors, and its surface, where they are missing."""
+        picture = self.root / nuscenes.map_path(self.location)
         if not picture.exists():
             write_map_picture(picture, self.city)
-        nuscenes.write_tables(self.root / nuscenes.VERSION, rows)
+        expansion = self.root / "maps" / "expansion" / f"{self.location}.json"
+        if not expansion.exists():
+            write_map_expansion(expansion, self.city)
+        surface = self.root / "synth_gt" / "surface" / f"{self.location}.npz"
+        if self.preset.surface and not surface.exists():
+            write_surface(surface, sample_surface(self.city.mesh, SURFACE_SPACING_M))
 
 
-# ---- boxes -------------------------------------------------------------------------------------------------------
-
-
-def _corners(actor: Actor) -> NDArray[np.float64]:
-    """The eight corners (8, 3) of an actor's box, world metres."""
-    kind = KINDS[actor.kind]
-    signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (0.0, 1.0)])
-    local = signs * [kind.length_m, kind.width_m, kind.height_m]
-    c, s = np.cos(actor.yaw_rad), np.sin(actor.yaw_rad)
-    return local @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + foot_of(actor)
-
-
-def _pixels_of(actors: Sequence[Actor], camera: Camera, instances: NDArray[np.int32]) -> dict[int, tuple[float, float]]:
-    """For each actor in front of a camera: pixels seen, and pixels that its box would fill if nothing hid it."""
-    numbers, counts = np.unique(instances, return_counts=True)
-    seen = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
-    image = shapely.box(0, 0, camera.width_px, camera.height_px)
-    pixels = {}
-    for actor in actors:
-        projected, depth_m = camera.project(_corners(actor))
-        if depth_m.min() > 0.1:  # partly behind the camera: its outline has no area there
-            outline = shapely.MultiPoint(projected).convex_hull
-            filled = 0.65 * outline.intersection(image).area  # a car fills about two thirds of its box's outline
-            if filled > 1:
-                pixels[actor.instance] = float(seen.get(actor.instance, 0)), float(filled)
-    return pixels
-
-
-def _boxes(
-    plan: DrivePlan, shots: Sequence[Shot], seen: Sequence[dict[int, tuple[float, float]]]
-) -> dict[int, list[nuscenes.Box]]:
-    """Annotations of every keyframe: all actors within reach, seen or not, as nuScenes has them."""
-    sums: dict[tuple[int, int], NDArray[np.float64]] = {}
-    for shot, pixels in zip(shots, seen, strict=True):
-        for instance, pair in pixels.items():
-            key = shot.moment // SWEEPS_A_KEYFRAME, instance
-            sums[key] = sums.get(key, np.zeros(2)) + pair
-    moving = {track.instance: track.is_moving for track in plan.traffic.tracks}
-    boxes: dict[int, list[nuscenes.Box]] = {}
-    for keyframe in range(plan.keyframes):
-        time_s = (plan.keyframe_us(keyframe) - plan.start_us) / 1e6
-        place = plan.pose(time_s)[:2]
-        boxes[keyframe] = []
-        for actor in plan.traffic.actors(time_s, place):
-            if np.hypot(actor.x_m - place[0], actor.y_m - place[1]) < ANNOTATED_M:
-                visible, expected = sums.get((keyframe, actor.instance), np.array([0.0, 1.0]))
-                boxes[keyframe].append(_box(actor, moving[actor.instance], float(min(visible / expected, 1.0))))
-    return boxes
-
-
-def _box(actor: Actor, is_moving: bool, visible_share: float) -> nuscenes.Box:
-    kind = KINDS[actor.kind]
-    x, y, foot_m = foot_of(actor).tolist()
-    return nuscenes.Box(
-        instance=actor.instance,
-        category=kind.category,
-        attribute=_attribute(kind.category, is_moving),
-        centre_m=(x, y, foot_m + kind.height_m / 2),
-        size_m=(kind.width_m, kind.length_m, kind.height_m),
-        yaw_rad=actor.yaw_rad,
-        visible_share=visible_share,
-    )
-
-
-def _attribute(category: str, is_moving: bool) -> str:
-    if category.startswith("human"):
-        return "pedestrian.moving" if is_moving else "pedestrian.standing"
-    if category == "vehicle.bicycle":
-        return "cycle.with_rider"
-    return "vehicle.moving" if is_moving else "vehicle.parked"
+def _write_tables(root: Path, preset: SynthPreset) -> None:
+    """Join the rows of all drives into the tables."""
+    drives: list[Rows] = [
+        json.loads(_rows_file(root, order.scene).read_text(encoding="utf-8")) for order in preset.drives
+    ]
+    rows = nuscenes.merge([nuscenes.vocabulary_rows(preset.lidar), *drives])
+    rows["map"] = [nuscenes.map_row(location, rows["log"]) for location in preset.towns]
+    nuscenes.write_tables(root / preset.version, rows)

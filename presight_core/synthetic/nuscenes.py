@@ -1,9 +1,7 @@
 """The nuScenes v1.0 tables of synthetic drives: rows, tokens and files as the official schema has them."""
 
 import hashlib
-import json
-import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from presight_core.frames import quaternion_from_rotation
-from presight_core.synthetic.drive_plan import SWEEPS_A_KEYFRAME, DrivePlan, Shot
+from presight_core.synthetic.drive_plan import DrivePlan, Shot, Turn
+from presight_core.synthetic.files import write_json
+from presight_core.synthetic.lidar import ego_from_lidar
 from presight_core.synthetic.rig import RIG
 
-VERSION = "v1.0-mini"
 TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample", "sample_annotation",
     "sample_data", "scene", "sensor", "visibility",
@@ -49,6 +48,18 @@ class Box:
     size_m: tuple[float, float, float]  # width, length, height, as nuScenes orders them
     yaw_rad: float
     visible_share: float
+    lidar_points: int
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One file that a sensor wrote."""
+
+    channel: str
+    path: str  # relative to the data root
+    when: Shot | Turn
+    format: str
+    size_px: tuple[int, int]  # width and height; as in nuScenes 0 for point clouds
 
 
 def token(*parts: object) -> str:
@@ -68,16 +79,33 @@ def truth_path(plan: DrivePlan, shot: Shot) -> str:
     return f"synth_gt/{plan.name}/{shot.timestamp_us}_{shot.mount.channel}.npz"
 
 
+def sweep_path(plan: DrivePlan, turn: Turn) -> str:
+    """Where the lidar's points of a turn go, relative to the data root."""
+    folder = "samples" if turn.is_keyframe else "sweeps"
+    return f"{folder}/LIDAR_TOP/{logfile(plan)}__LIDAR_TOP__{turn.timestamp_us}.pcd.bin"
+
+
+def occupancy_path(plan: DrivePlan, keyframe: int) -> str:
+    """Where the Occ3D labels of a keyframe go, relative to the data root."""
+    return f"gts/{plan.name}/{sample_token(plan, keyframe)}/labels.npz"
+
+
 def logfile(plan: DrivePlan) -> str:
     """Name of the log that a drive is cut from."""
-    return f"synth-{plan.captured}-{plan.number:04d}"
+    return f"synth-{plan.captured}-{plan.order.number:04d}"
+
+
+def sample_token(plan: DrivePlan, keyframe: int) -> str:
+    """Token of a keyframe; empty before the first and after the last."""
+    return token(plan.name, "sample", keyframe) if 0 <= keyframe < plan.keyframes else ""
 
 
 # ---- rows --------------------------------------------------------------------------------------------------------
 
 
-def vocabulary_rows() -> Rows:
-    """Tables that are the same for every data set."""
+def vocabulary_rows(lidar: bool) -> Rows:
+    """Tables that are the same for every data set with or without a lidar."""
+    sensors = [(mount.channel, "camera") for mount in RIG] + [("LIDAR_TOP", "lidar")] * lidar
     return {
         "category": [{"token": token("category", c), "name": c, "description": ""} for c in CATEGORIES],
         "attribute": [{"token": token("attribute", a), "name": a, "description": ""} for a in ATTRIBUTES],
@@ -85,23 +113,38 @@ def vocabulary_rows() -> Rows:
             {"token": str(number), "level": level, "description": f"visibility of whole object: {level[1:]} %"}
             for number, level in enumerate(VISIBILITY, 1)
         ],
-        "sensor": [{"token": token("sensor", m.channel), "channel": m.channel, "modality": "camera"} for m in RIG],
+        "sensor": [
+            {"token": token("sensor", channel), "channel": channel, "modality": modality}
+            for channel, modality in sensors
+        ],
     }
+
+
+def map_path(location: str) -> str:
+    """Where the map picture of a city goes, relative to the data root."""
+    return f"maps/{token('map', location)}.png"
 
 
 def map_row(location: str, logs: Sequence[Row]) -> Row:
-    """The row that ties logs to the picture of their map."""
-    name = token("map", location)
+    """The row that ties the logs of a city to the picture of its map."""
     return {
-        "token": name,
-        "log_tokens": [row["token"] for row in logs],
+        "token": token("map", location),
+        "log_tokens": [row["token"] for row in logs if row["location"] == location],
         "category": "semantic_prior",
-        "filename": f"maps/{name}.png",
+        "filename": map_path(location),
     }
 
 
+def recordings(
+    plan: DrivePlan, shots: Sequence[Shot], turns: Sequence[Turn], size_px: tuple[int, int]
+) -> list[Recording]:
+    """All files of a drive's sensors: first the images in their order, then the sweeps of the lidar."""
+    images = [Recording(shot.mount.channel, image_path(plan, shot), shot, "jpg", size_px) for shot in shots]
+    return images + [Recording("LIDAR_TOP", sweep_path(plan, turn), turn, "pcd", (0, 0)) for turn in turns]
+
+
 def drive_rows(
-    plan: DrivePlan, location: str, size_px: tuple[int, int], shots: Sequence[Shot], boxes: Mapping[int, Sequence[Box]]
+    plan: DrivePlan, files: Sequence[Recording], size_px: tuple[int, int], boxes: Mapping[int, Sequence[Box]]
 ) -> Rows:
     """Rows of one drive. `boxes` holds the annotations of each keyframe, by its number."""
     rows: Rows = {
@@ -111,20 +154,16 @@ def drive_rows(
                 "logfile": logfile(plan),
                 "vehicle": "synth",
                 "date_captured": plan.captured,
-                "location": location,
+                "location": plan.order.location,
             }
         ],
         "scene": [_scene_row(plan)],
         "sample": _sample_rows(plan),
-        "calibrated_sensor": _calibration_rows(plan, size_px),
-        "ego_pose": [_pose_row(plan, shot) for shot in shots],
-        "sample_data": _image_rows(plan, size_px, shots),
+        "calibrated_sensor": _calibration_rows(plan, size_px, {file.channel for file in files}),
+        "ego_pose": [_pose_row(plan, file) for file in files],
+        "sample_data": _file_rows(plan, files),
     }
     return rows | _annotation_rows(plan, boxes)
-
-
-def _sample_token(plan: DrivePlan, keyframe: int) -> str:
-    return token(plan.name, "sample", keyframe) if 0 <= keyframe < plan.keyframes else ""
 
 
 def _scene_row(plan: DrivePlan) -> Row:
@@ -132,73 +171,74 @@ def _scene_row(plan: DrivePlan) -> Row:
         "token": token(plan.name),
         "log_token": token(plan.name, "log"),
         "nbr_samples": plan.keyframes,
-        "first_sample_token": _sample_token(plan, 0),
-        "last_sample_token": _sample_token(plan, plan.keyframes - 1),
+        "first_sample_token": sample_token(plan, 0),
+        "last_sample_token": sample_token(plan, plan.keyframes - 1),
         "name": plan.name,
-        "description": f"Synthetic city, {plan.light}",
+        "description": f"Synthetic city, {plan.order.light}",
     }
 
 
 def _sample_rows(plan: DrivePlan) -> list[Row]:
     return [
         {
-            "token": _sample_token(plan, keyframe),
+            "token": sample_token(plan, keyframe),
             "timestamp": plan.keyframe_us(keyframe),
-            "prev": _sample_token(plan, keyframe - 1),
-            "next": _sample_token(plan, keyframe + 1),
+            "prev": sample_token(plan, keyframe - 1),
+            "next": sample_token(plan, keyframe + 1),
             "scene_token": token(plan.name),
         }
         for keyframe in range(plan.keyframes)
     ]
 
 
-def _calibration_rows(plan: DrivePlan, size_px: tuple[int, int]) -> list[Row]:
+def _calibration_rows(plan: DrivePlan, size_px: tuple[int, int], channels: Container[str]) -> list[Row]:
+    mounted = [(mount.channel, mount.ego_from_camera, mount.intrinsics(*size_px).tolist()) for mount in RIG]
+    mounted.append(("LIDAR_TOP", ego_from_lidar(), []))
     return [
         {
-            "token": token(plan.name, "calibration", mount.channel),
-            "sensor_token": token("sensor", mount.channel),
-            "translation": list(mount.position_m),
-            "rotation": _quaternion(mount.ego_from_camera),
-            "camera_intrinsic": mount.intrinsics(*size_px).tolist(),
+            "token": token(plan.name, "calibration", channel),
+            "sensor_token": token("sensor", channel),
+            "translation": ego_from_sensor[:3, 3].tolist(),
+            "rotation": _quaternion(ego_from_sensor),
+            "camera_intrinsic": intrinsics,
         }
-        for mount in RIG
+        for channel, ego_from_sensor, intrinsics in mounted
+        if channel in channels
     ]
 
 
-def _pose_row(plan: DrivePlan, shot: Shot) -> Row:
-    world_from_ego = plan.world_from_ego(shot.time_s)
+def _pose_row(plan: DrivePlan, file: Recording) -> Row:
+    world_from_ego = plan.recorded_pose(file.when.time_s)
     return {
-        "token": token(image_path(plan, shot)),
-        "timestamp": shot.timestamp_us,
+        "token": token(file.path),
+        "timestamp": file.when.timestamp_us,
         "rotation": _quaternion(world_from_ego),
         "translation": world_from_ego[:3, 3].tolist(),
     }
 
 
-def _image_rows(plan: DrivePlan, size_px: tuple[int, int], shots: Sequence[Shot]) -> list[Row]:
+def _file_rows(plan: DrivePlan, files: Sequence[Recording]) -> list[Row]:
     rows: list[Row] = []
     latest: dict[str, Row] = {}
-    for shot in shots:
-        path = image_path(plan, shot)
-        following = -(-shot.moment // SWEEPS_A_KEYFRAME)  # a sweep belongs to the keyframe that comes next
-        previous = latest.get(shot.mount.channel)
+    for file in files:
+        previous = latest.get(file.channel)
         row = {
-            "token": token(path),
-            "sample_token": _sample_token(plan, following),
-            "ego_pose_token": token(path),
-            "calibrated_sensor_token": token(plan.name, "calibration", shot.mount.channel),
-            "timestamp": shot.timestamp_us,
-            "fileformat": "jpg",
-            "is_key_frame": shot.is_keyframe,
-            "height": size_px[1],
-            "width": size_px[0],
-            "filename": path,
+            "token": token(file.path),
+            "sample_token": sample_token(plan, file.when.keyframe),
+            "ego_pose_token": token(file.path),
+            "calibrated_sensor_token": token(plan.name, "calibration", file.channel),
+            "timestamp": file.when.timestamp_us,
+            "fileformat": file.format,
+            "is_key_frame": file.when.is_keyframe,
+            "height": file.size_px[1],
+            "width": file.size_px[0],
+            "filename": file.path,
             "prev": previous["token"] if previous else "",
             "next": "",
         }
         if previous:
             previous["next"] = row["token"]
-        latest[shot.mount.channel] = row
+        latest[file.channel] = row
         rows.append(row)
     return rows
 
@@ -231,7 +271,7 @@ def _annotation_row(plan: DrivePlan, keyframe: int, box: Box, chain: Sequence[st
     level = int(np.searchsorted([0.4, 0.6, 0.8], box.visible_share, side="right"))
     return {
         "token": chain[1],
-        "sample_token": _sample_token(plan, keyframe),
+        "sample_token": sample_token(plan, keyframe),
         "instance_token": token(plan.name, "instance", box.instance),
         "visibility_token": str(level + 1),
         "attribute_tokens": [token("attribute", box.attribute)],
@@ -240,7 +280,7 @@ def _annotation_row(plan: DrivePlan, keyframe: int, box: Box, chain: Sequence[st
         "rotation": [float(np.cos(box.yaw_rad / 2)), 0.0, 0.0, float(np.sin(box.yaw_rad / 2))],
         "prev": chain[0],
         "next": chain[2],
-        "num_lidar_pts": 0,
+        "num_lidar_pts": box.lidar_points,
         "num_radar_pts": 0,
     }
 
@@ -249,7 +289,7 @@ def _quaternion(a_from_b: NDArray[np.float64]) -> list[float]:
     return quaternion_from_rotation(a_from_b[:3, :3]).tolist()
 
 
-# ---- files -------------------------------------------------------------------------------------------------------
+# ---- tables ------------------------------------------------------------------------------------------------------
 
 
 def merge(parts: Iterable[Rows]) -> Rows:
@@ -265,11 +305,3 @@ def write_tables(folder: Path, rows: Rows) -> None:
     """Write every table; `scene.json`, which readers look for first, comes last."""
     for table in sorted(TABLES, key=lambda name: name == "scene"):
         write_json(folder / f"{table}.json", rows[table])
-
-
-def write_json(path: Path, content: object) -> None:
-    """Replace a JSON file as a whole, so that nobody ever reads half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    unfinished.write_text(json.dumps(content, indent=0), encoding="utf-8")
-    unfinished.replace(path)

@@ -1,0 +1,110 @@
+"""A contact sheet: one look at a synthetic data set, drawn from its files."""
+
+import json
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from presight_core.maps import MapView, birds_eye, height_colours
+from presight_core.pictures import depth_image, label_image, save_png, stack_rows, title_strip
+from presight_core.synthetic import nuscenes
+from presight_core.synthetic.map_picture import PIXELS_A_METRE
+from presight_core.synthetic.occupancy import COLOURS, FREE
+from presight_core.synthetic.presets import DriveOrder, SynthPreset
+
+Rgb = NDArray[np.uint8]
+
+AROUND = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT")
+ROW_PX = 135  # height of a row: six cameras then fit a page of 1,450 pixels
+MAP_PX = 460
+REACH_M = 40.0  # of the bird's-eye pictures
+ROLE_COLOURS = {"train": (40, 110, 220), "prior": (30, 150, 60), "test": (220, 60, 40)}
+
+
+def draw_contact_sheet(root: Path, preset: SynthPreset) -> Path:
+    """Draw a drive of each town and light at half time, the ground truth of the first, and the maps."""
+    rows: list[Rgb] = []
+    shown: set[tuple[str, str]] = set()
+    for order in preset.drives:
+        if (order.location, order.light) not in shown:
+            shown.add((order.location, order.light))
+            images = [_Moment(root, order).image(channel) for channel in AROUND]
+            rows.append(_titled(f"{order.scene}, {order.location}, {order.light}", images, ROW_PX))
+    first = _Moment(root, preset.drives[0])
+    rows.append(_titled(f"{first.order.scene}, ground truth: depth, classes, objects", first.truth(), ROW_PX))
+    if preset.lidar or preset.occupancy:
+        rows.append(_titled("from above: lidar, occupancy", first.from_above(preset), MAP_PX))
+    maps = [_map(root, preset, location) for location in preset.towns]
+    rows.append(_titled("the cities and their drives: train blue, prior green, test red", maps, MAP_PX))
+    file = root / "contact_sheet.png"
+    save_png(file, stack_rows([[row] for row in rows]))
+    return file
+
+
+class _Moment:
+    """The keyframe at half time of a drive, read from its files."""
+
+    def __init__(self, root: Path, order: DriveOrder):
+        self.root, self.order = root, order
+
+    @cached_property
+    def _rows(self) -> dict[str, list[dict[str, Any]]]:
+        return json.loads((self.root / "synth_gt" / self.order.scene / "rows.json").read_text(encoding="utf-8"))
+
+    @cached_property
+    def _sample(self) -> dict[str, Any]:
+        return self._rows["sample"][len(self._rows["sample"]) // 2]
+
+    def _file(self, channel: str) -> Path:
+        rows = (row for row in self._rows["sample_data"] if row["sample_token"] == self._sample["token"])
+        return self.root / next(r["filename"] for r in rows if r["is_key_frame"] and f"/{channel}/" in r["filename"])
+
+    def image(self, channel: str) -> Rgb:
+        """What a camera sees."""
+        return np.asarray(cv2.imread(str(self._file(channel)))[..., ::-1], np.uint8)
+
+    def truth(self) -> list[Rgb]:
+        """Depth, classes and objects of the front cameras, and the image itself."""
+        timestamp = self._file("CAM_FRONT").stem.split("__")[2]
+        with np.load(self.root / "synth_gt" / self.order.scene / f"{timestamp}_CAM_FRONT.npz") as truth:
+            depth, labels, instances = truth["depth"], truth["labels"], truth["instances"]
+        colours = np.random.default_rng(0).integers(40, 256, (4096, 3)).astype(np.uint8)  # any, but different
+        objects = np.where(instances[..., None] > 0, colours[instances % 4096], 0).astype(np.uint8)
+        return [self.image("CAM_FRONT"), depth_image(depth), label_image(labels), objects]
+
+    def from_above(self, preset: SynthPreset) -> list[Rgb]:
+        """Lidar points by height and occupied voxels by class, the car's front upwards."""
+        pictures = []
+        if preset.lidar:
+            points = np.fromfile(self._file("LIDAR_TOP"), np.float32).reshape(-1, 5)
+            view = MapView((-REACH_M, REACH_M), (-REACH_M, REACH_M), pixel_m=2 * REACH_M / MAP_PX)
+            pictures.append(birds_eye(points[:, :3], height_colours(points[:, 2:3]), view, point_m=0.25))  # 0.25: so that they show
+        if preset.occupancy:
+            with np.load(self.root / "gts" / self.order.scene / self._sample["token"] / "labels.npz") as labels:
+                semantics = labels["semantics"]
+            highest = semantics.shape[2] - 1 - np.argmax(semantics[..., ::-1] != FREE, axis=2)
+            classes = np.take_along_axis(semantics, highest[..., None], 2)[..., 0]
+            pictures.append(COLOURS[classes][::-1, ::-1])
+        return pictures
+
+
+def _map(root: Path, preset: SynthPreset, location: str) -> Rgb:
+    """The map picture of a city with the tracks of its drives."""
+    grey = np.asarray(cv2.imread(str(root / nuscenes.map_path(location)), cv2.IMREAD_GRAYSCALE))
+    picture = np.repeat((235 - grey // 3)[..., None], 3, axis=2).astype(np.uint8)  # streets a little darker than paper
+    for order in (order for order in preset.drives if order.location == location):
+        poses = json.loads((root / "synth_gt" / order.scene / "rows.json").read_text(encoding="utf-8"))["ego_pose"]
+        track = np.array([pose["translation"][:2] for pose in poses]) * PIXELS_A_METRE
+        pixels = np.round(np.c_[track[:, 0], len(grey) - track[:, 1]]).astype(np.int32)
+        cv2.polylines(picture, [pixels], False, ROLE_COLOURS[order.role], 25)
+    return cv2.resize(picture, (MAP_PX, MAP_PX), interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+def _titled(title: str, images: Sequence[Rgb], height_px: int) -> Rgb:
+    row = stack_rows([images], height_px=height_px)
+    return np.concatenate([title_strip(title, row.shape[1]), row])
