@@ -1,13 +1,14 @@
-"""Daylight: sun, sky and camera response of a drive, as plain numbers that the kernels read."""
+"""Light: sun, sky, lamps and camera response of a drive, as plain numbers that the kernels read."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-KINDS = ("day", "overcast", "dusk")
+KINDS = ("day", "overcast", "dusk", "night")
 
 Colour = tuple[float, float, float]
+SODIUM, LED = np.array([1.0, 0.58, 0.24]), np.array([0.95, 0.88, 0.78])  # street lamps, old and new
 
 
 class Lighting(NamedTuple):
@@ -21,10 +22,14 @@ class Lighting(NamedTuple):
     glow: float  # of the sky around the sun
     clouds: float  # cover in 0..1
     haze_m: float  # distance at which haze takes 63 %
-    lamps: float  # brightness of lamps and lit windows
+    lamps: float  # brightness of street lamps, head lights and windows; 0: all off
+    lamp_colour: Colour  # of street lamps: sodium to LED
+    lit_share: float  # of windows
     exposure: float
     balance: Colour  # of the camera's channels
-    noise: float  # sensor noise at mid grey
+    shot_noise: float  # variance a unit of light
+    read_noise: float  # standard deviation in the dark
+    blur: float  # of long exposures, sigma in image widths
 
 
 class _Recipe(NamedTuple):
@@ -39,17 +44,22 @@ class _Recipe(NamedTuple):
     clouds: tuple[float, float]
     haze_m: float
     lamps: float
+    lit_share: float
     exposure: float
-    noise: float
+    shot_noise: float
+    read_noise: float
+    blur: float
 
 
 _RECIPES = {
     "day": _Recipe((0.6, 1.1), (2.3, 2.2, 2.0), (0.75, 0.85, 1.0), (0.75, 0.85, 0.95), (0.25, 0.45, 0.85),
-                   0.6, (0.2, 0.8), 900.0, 0.0, 0.82, 0.010),
+                   0.6, (0.2, 0.8), 900.0, 0.0, 0.0, 0.82, 3e-4, 0.001, 0.0),
     "overcast": _Recipe((0.8, 1.1), (0.30, 0.30, 0.30), (1.25, 1.3, 1.35), (0.95, 0.97, 1.0), (0.75, 0.80, 0.86),
-                        0.1, (0.5, 0.9), 450.0, 0.0, 0.78, 0.012),
+                        0.1, (0.5, 0.9), 450.0, 0.0, 0.0, 0.78, 4e-4, 0.0015, 0.0),
     "dusk": _Recipe((0.12, 0.25), (1.9, 1.05, 0.55), (0.45, 0.45, 0.58), (1.0, 0.62, 0.38), (0.22, 0.30, 0.55),
-                    1.2, (0.4, 0.9), 700.0, 0.8, 0.95, 0.018),
+                    1.2, (0.4, 0.9), 700.0, 0.6, 0.3, 0.95, 8e-4, 0.003, 0.0),
+    "night": _Recipe((0.5, 1.0), (0.0, 0.0, 0.0), (0.013, 0.013, 0.018), (0.050, 0.040, 0.034),
+                     (0.009, 0.010, 0.016), 0.0, (0.0, 0.8), 900.0, 1.0, 0.4, 1.7, 3e-3, 0.010, 0.0015),
 }  # fmt: skip
 
 
@@ -58,6 +68,9 @@ def sample_lighting(kind: str, rng: np.random.Generator) -> Lighting:
     recipe = _RECIPES[kind]
     azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(*recipe.elevation)
     balance = np.exp(rng.normal(0, 0.05, 3))  # 5 %: automatic white balance is seldom better
+    clouds = float(rng.uniform(*recipe.clouds))
+    exposure = float(recipe.exposure * np.exp(rng.normal(0, 0.10)))  # 10 %: automatic exposure
+    whiteness = rng.random()
     return Lighting(
         to_sun=_colour([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]),
         sun=recipe.sun,
@@ -65,12 +78,16 @@ def sample_lighting(kind: str, rng: np.random.Generator) -> Lighting:
         horizon=recipe.horizon,
         zenith=recipe.zenith,
         glow=recipe.glow,
-        clouds=float(rng.uniform(*recipe.clouds)),
+        clouds=clouds,
         haze_m=recipe.haze_m,
         lamps=recipe.lamps,
-        exposure=float(recipe.exposure * np.exp(rng.normal(0, 0.10))),  # 10 %: automatic exposure
+        lamp_colour=_colour(SODIUM + (LED - SODIUM) * whiteness),
+        lit_share=recipe.lit_share,
+        exposure=exposure,
         balance=_colour(balance / balance.mean()),
-        noise=recipe.noise,
+        shot_noise=recipe.shot_noise,
+        read_noise=recipe.read_noise,
+        blur=recipe.blur,
     )
 
 

@@ -1,20 +1,23 @@
-"""Deferred shading: the colour of every pixel, from the faces that its samples see.
+"""Deferred shading: the light on every pixel, from the faces that its samples see.
 
-A pixel is the tent-filtered sum of 3 x 3 samples half a pixel apart, its own centre in the middle; each face is
-shaded once a pixel, at its first sample, so that edges are smooth and textures stay cheap.
+With antialiasing a pixel is the tent-filtered sum of 3 x 3 samples half a pixel apart, its own centre in the middle;
+each face is shaded once a pixel, at its first sample, so that edges are smooth and textures stay cheap. Without, a
+pixel is the one sample at its centre.
 """
 
-# ruff: noqa: PLR0911, PLR0913, PLR0917 - kernels take plain numbers and leave early
+# ruff: noqa: PLR0913, PLR0917 - kernels take plain numbers and leave early
 
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from presight_core.synthetic.jit import inner, kernel, spliced
+from presight_core.synthetic.lamps import Lamps, beam_light, street_light
 from presight_core.synthetic.lighting import Lighting
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import Mesh
-from presight_core.synthetic.noise import band, hash01, value_noise
+from presight_core.synthetic.noise import band, value_noise
 from presight_core.synthetic.raster import PinholeView
 from presight_core.synthetic.shadow import ShadowMap, Shadows, occlusion
 from presight_core.synthetic.textures import brightness, facade, grass, is_ground, wear
@@ -27,6 +30,9 @@ _CAR_PAINT, _CAR_GLASS, _LAMP = int(Material.CAR_PAINT), int(Material.CAR_GLASS)
 _HEAD_LIGHT, _TAIL_LIGHT = int(Material.HEAD_LIGHT), int(Material.TAIL_LIGHT)
 _TRAFFIC_LIGHT = int(Material.TRAFFIC_LIGHT)
 
+LAMP_LIGHT = 0.75  # straight below a street lamp
+BEAM_LIGHT = 0.70  # of head lights on a wall at 7 m
+
 
 class Scene(NamedTuple):
     """All that the shader reads."""
@@ -37,6 +43,8 @@ class Scene(NamedTuple):
     shadows: Shadows  # of the city
     actor_sun: ShadowMap
     actor_sky: ShadowMap
+    lamps: Lamps
+    beams: NDArray[np.float64]  # (B, 5) head lights, see `head_light_beams`
 
 
 @inner
@@ -83,7 +91,7 @@ def shade_point(scene, face, ray, depth, focal, position):
     if is_ground(material):
         footprint = 0.5 * distance / focal / max(-facing, 0.02)  # half: between a pixel's short and long axis
     red, green, blue, gloss, glow_r, glow_g, glow_b = surface(
-        material, x, y, z, (nx, ny, nz), mesh.walls[face], mesh.colours[face], footprint, light.lamps
+        material, x, y, z, (nx, ny, nz), mesh.walls[face], mesh.colours[face], footprint, -facing, light
     )
     if material == _FOLIAGE:  # leaves point anywhere
         nx += 1.6 * (value_noise(4 * x + 7, 4 * z, 33) - 0.5)
@@ -91,9 +99,13 @@ def shade_point(scene, face, ray, depth, focal, position):
         norm = np.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx / norm, ny / norm, nz / norm
     sun, sky = received(scene, material, (x, y, z), (nx, ny, nz))
-    red = red * (light.ambient[0] * sky + light.sun[0] * sun) + glow_r
-    green = green * (light.ambient[1] * sky + light.sun[1] * sun) + glow_g
-    blue = blue * (light.ambient[2] * sky + light.sun[2] * sun) + glow_b
+    street, beam = 0.0, 0.0
+    if light.lamps > 0:
+        street = LAMP_LIGHT * light.lamps * (0.3 + 0.7 * sky) * street_light(scene.lamps, x, y, z, nx, ny, nz)
+        beam = BEAM_LIGHT * light.lamps * beam_light(scene.beams, x, y, z, nx, ny, nz)
+    red = red * (light.ambient[0] * sky + light.sun[0] * sun + light.lamp_colour[0] * street + beam) + glow_r
+    green = green * (light.ambient[1] * sky + light.sun[1] * sun + light.lamp_colour[1] * street + beam) + glow_g
+    blue = blue * (light.ambient[2] * sky + light.sun[2] * sun + light.lamp_colour[2] * street + 0.9 * beam) + glow_b
     if gloss > 0:
         rx, ry, rz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
         mirror = sky_colour(rx, ry, max(rz, 0.03), light)
@@ -105,12 +117,15 @@ def shade_point(scene, face, ray, depth, focal, position):
 
 
 @inner
-def surface(material, x, y, z, normal, wall, colour, footprint, lamps):
-    """Reflectance (3), gloss and emitted radiance (3) of a surface point."""
+def surface(material, x, y, z, normal, wall, colour, footprint, facing, light):
+    """Reflectance (3), gloss and emitted radiance (3) of a surface point; `facing` is the cosine to the viewer."""
     red, green, blue = float(colour[0]), float(colour[1]), float(colour[2])
     if material == _FACADE:
-        red, green, blue, gloss, lit = facade(x, y, z, normal, wall, footprint, (red, green, blue), lamps)
-        return red, green, blue, gloss, 0.8 * lit * lamps, 0.62 * lit * lamps, 0.38 * lit * lamps
+        red, green, blue, gloss, lit, warm = facade(
+            x, y, z, normal, wall, footprint, (red, green, blue), light.lit_share
+        )
+        lit *= light.lamps
+        return red, green, blue, gloss, 0.8 * lit, (0.76 - 0.18 * warm) * lit, (0.66 - 0.36 * warm) * lit
     if material in (_GRASS, _FAR_GROUND):
         k, dry = grass(x, y, footprint)
         return red * k * (0.8 + 0.7 * dry), green * k * (0.9 + 0.25 * dry), blue * k, 0.0, 0.0, 0.0, 0.0
@@ -127,13 +142,26 @@ def surface(material, x, y, z, normal, wall, colour, footprint, lamps):
         return red, green, blue, 0.10, 0.0, 0.0, 0.0
     if material == _CAR_GLASS:
         return red, green, blue, 0.35, 0.0, 0.0, 0.0
-    if material in (_LAMP, _HEAD_LIGHT):
-        return red, green, blue, 0.0, 4.0 * lamps, 3.4 * lamps, 2.4 * lamps
-    if material == _TAIL_LIGHT:
-        return red, green, blue, 0.0, 1.2 * lamps, 0.0, 0.0
+    glow_r, glow_g, glow_b = emission(material, red, green, blue, normal[2], wall[0], facing, light)
+    return red, green, blue, 0.0, glow_r, glow_g, glow_b
+
+
+@inner
+def emission(material, red, green, blue, up, is_on, facing, light):
+    """Radiance (3) of what shines by itself; `up` is the normal's height, `is_on` whether a vehicle is driven."""
+    lamps = light.lamps
+    if material == _LAMP:
+        bright = lamps * (10.0 if up < -0.5 else 2.5)  # glass below, housing above
+        return bright * light.lamp_colour[0], bright * light.lamp_colour[1], bright * light.lamp_colour[2]
+    if material == _HEAD_LIGHT and is_on > 0:
+        bright = lamps * (0.8 + 9 * facing**4)
+        return bright, 0.95 * bright, 0.85 * bright
+    if material == _TAIL_LIGHT and is_on > 0:
+        return 2.5 * lamps, 0.06 * lamps, 0.04 * lamps
     if material == _TRAFFIC_LIGHT and red + green + blue > 0.5:  # the lens that is on
-        return red, green, blue, 0.0, 1.2 * red, 1.2 * green, 1.2 * blue
-    return red, green, blue, 0.0, 0.0, 0.0, 0.0
+        bright = 1.2 + 1.5 * lamps
+        return bright * red, bright * green, bright * blue
+    return 0.0, 0.0, 0.0
 
 
 @spliced
@@ -159,15 +187,9 @@ def received(scene, material, point, normal):
     return sun, sky
 
 
-@inner
-def display(radiance, exposure):
-    """Film-like response: linear in the shadows, no hard clipping in the lights; then the 2.2 display curve."""
-    return (1 - np.exp(-max(radiance, 0.0) * exposure)) ** 0.4545
-
-
 @spliced
-def sample_colour(scene, view, face, row, column, nearness):
-    """Displayed colour (3) of what one sample sees; `view` is in sample coordinates."""
+def sample_light(scene, view, face, row, column, nearness, samples_a_pixel):
+    """Exposure (3) by what one sample sees, 1 at the white point; `view` is in sample coordinates."""
     cx = (column - view.centre_x) / view.focal_x
     cy = (row - view.centre_y) / view.focal_y
     r, light = view.camera_from_world, scene.lighting
@@ -180,48 +202,39 @@ def sample_colour(scene, view, face, row, column, nearness):
         stretch = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
         red, green, blue = sky_colour(ray[0] / stretch, ray[1] / stretch, ray[2] / stretch, light)
     else:
-        pixel_focal = 0.5 * view.focal_x  # samples are half a pixel apart
-        red, green, blue = shade_point(scene, face, ray, 1.0 / nearness, pixel_focal, view.position)
-    return (
-        display(red * light.balance[0], light.exposure),
-        display(green * light.balance[1], light.exposure),
-        display(blue * light.balance[2], light.exposure),
-    )
+        red, green, blue = shade_point(scene, face, ray, 1.0 / nearness, view.focal_x / samples_a_pixel, view.position)
+    gain = light.exposure
+    return gain * red * light.balance[0], gain * green * light.balance[1], gain * blue * light.balance[2]
 
 
 @kernel
-def shade_view(scene: Scene, view: PinholeView, nearness, faces, seed: int, rgb):
-    """Fill `rgb` (H, W, 3) uint8 from sample buffers (2 H + 1, 2 W + 1)."""
-    height, width = rgb.shape[0], rgb.shape[1]
-    noise = scene.lighting.noise
+def shade_view(scene: Scene, view: PinholeView, antialias: bool, nearness, faces, exposure):
+    """Fill `exposure` (H, W, 3) float32 from sample buffers: (2 H + 1, 2 W + 1), or (H, W) without antialiasing."""
+    height, width = exposure.shape[0], exposure.shape[1]
     for row in range(height):
         for column in range(width):
-            red, green, blue = pixel_colour(scene, view, nearness, faces, 2 * row + 1, 2 * column + 1)
-            off_x, off_y = (column - width / 2) / width, (row - height / 2) / width
-            falloff = 1 - 0.5 * (off_x * off_x + off_y * off_y)  # vignetting
-            for channel, value in enumerate((red, green, blue)):
-                grain = hash01(3 * column + channel, row, seed) + hash01(3 * column + channel, row, seed + 1) - 1
-                seen = value * falloff + 2.4 * noise * grain * (0.35 + value)  # 2.4: two uniforms to one sigma
-                rgb[row, column, channel] = np.uint8(min(max(seen * 255 + 0.5, 0.0), 255.0))
+            y, x = (2 * row + 1, 2 * column + 1) if antialias else (row, column)
+            red, green, blue = pixel_light(scene, view, antialias, nearness, faces, y, x)
+            exposure[row, column, 0], exposure[row, column, 1], exposure[row, column, 2] = red, green, blue
 
 
 @spliced
-def pixel_colour(scene, view, nearness, faces, row, column):
-    """Tent-filtered colour of the pixel whose centre sample is (row, column); faces are shaded once each."""
+def pixel_light(scene, view, antialias, nearness, faces, row, column):
+    """Exposure of the pixel whose centre sample is (row, column); faces are shaded once each."""
     red, green, blue = 0.0, 0.0, 0.0
     done = 0  # bit set of the nine samples
-    for order in range(9):  # the centre first: it stands for its face
+    for order in range(9 if antialias else 1):  # the centre first: it stands for its face
         index = (4, 0, 1, 2, 3, 5, 6, 7, 8)[order]
         if done >> index & 1:
             continue
         y, x = row + index // 3 - 1, column + index % 3 - 1
         face = faces[y, x]
-        weight = 0.0
-        for other in range(9):
+        weight = 0.0 if antialias else 1.0
+        for other in range(9 if antialias else 0):
             oy, ox = row + other // 3 - 1, column + other % 3 - 1
             if faces[oy, ox] == face:
                 done |= 1 << other
                 weight += (2 - abs(oy - row)) * (2 - abs(ox - column)) / 16.0
-        r, g, b = sample_colour(scene, view, face, y, x, nearness[y, x])
+        r, g, b = sample_light(scene, view, face, y, x, nearness[y, x], 2.0 if antialias else 1.0)
         red, green, blue = red + weight * r, green + weight * g, blue + weight * b
     return red, green, blue

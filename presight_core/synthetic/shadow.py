@@ -45,7 +45,8 @@ def shadow_map(mesh: Mesh, to_light: Colour, centre: ArrayLike, radius_m: float,
 
 def cast_shadows(mesh: Mesh, lighting: Lighting, centre: ArrayLike, radius_m: float) -> Shadows:
     """Sun and sky shadows of the city within a radius of a place; beyond it everything is lit."""
-    sun = shadow_map(mesh, lighting.to_sun, centre, radius_m, SUN_SAMPLE_M)
+    sun_radius_m = radius_m if max(lighting.sun) > 0 else 0.0  # no sun, no shadows
+    sun = shadow_map(mesh, lighting.to_sun, centre, sun_radius_m, SUN_SAMPLE_M)
     return Shadows(sun, shadow_map(mesh, ZENITH, centre, radius_m, SKY_SAMPLE_M))
 
 

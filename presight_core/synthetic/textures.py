@@ -87,8 +87,8 @@ def grass(x, y, footprint):
 
 
 @inner
-def facade(x, y, z, normal, wall, footprint, colour, lamps):
-    """Reflectance, gloss and emission of a wall with windows: (red, green, blue, gloss, light)."""
+def facade(x, y, z, normal, wall, footprint, colour, lit_share):
+    """Reflectance (3), gloss, emission and its warmth (0..1) of a wall with windows."""
     along = -normal[1] * x + normal[0] * y - wall[0]
     up = z - wall[2]
     pattern = int(wall[4])
@@ -100,7 +100,7 @@ def facade(x, y, z, normal, wall, footprint, colour, lamps):
         brick = np.floor((along + 0.25 * (course % 2)) / 0.5)
         k *= 1 + 0.35 * (hash01(int(brick), int(course), seed) - 0.5) * detail_strength(0.6, footprint)
     if wall[3] < 2.5 or up > wall[3] or wall[1] < 2.5:  # a gable, or too narrow for windows
-        return colour[0] * k, colour[1] * k, colour[2] * k, 0.0, 0.0
+        return colour[0] * k, colour[1] * k, colour[2] * k, 0.0, 0.0, 0.0
     floors = max(1.0, np.floor(wall[3] / 3.3 + 0.5))
     floor_m = wall[3] / floors
     bays = max(1.0, np.floor(wall[1] / (2.2 + 1.8 * hash01(seed, 1, 25)) + 0.5))
@@ -112,28 +112,33 @@ def facade(x, y, z, normal, wall, footprint, colour, lamps):
     low, high = (0.06, 0.76) if is_shop else (0.28, 0.74 + 0.1 * hash01(seed, 3, 27))
     inside_u, inside_v = half_width - abs(u - 0.5), min(v - low, high - v)
     if inside_u > 0 and inside_v > 0:
-        return window(inside_u * bay_m, inside_v * floor_m, u, v, int(bay) + 13 * seed, int(floor), lamps)
+        # Offices are dark at night, homes are lit, shops advertise.
+        share = 2 * lit_share if is_shop else lit_share * (0.3 + 1.4 * hash01(seed, 5, 45))
+        return window(inside_u * bay_m, inside_v * floor_m, u, v, int(bay) + 13 * seed, int(floor), share)
     if inside_u > -0.06 and inside_v > -0.05 and hash01(seed, 4, 28) < 0.6:  # surround
         k *= 1.3
     elif is_shop and v > 0.82:  # sign board
         hue = hash01(int(bay) // 2, seed, 29)
-        return 0.15 + 0.5 * hue, 0.12 + 0.4 * abs(hue - 0.5), 0.45 - 0.35 * hue, 0.05, 0.0
+        return 0.15 + 0.5 * hue, 0.12 + 0.4 * abs(hue - 0.5), 0.45 - 0.35 * hue, 0.05, 0.25 * lit_share, 0.3
     elif v < 0.05 and floor > 0:  # string course
         k *= 0.74
-    return colour[0] * k, colour[1] * k, colour[2] * k, 0.0, 0.0
+    return colour[0] * k, colour[1] * k, colour[2] * k, 0.0, 0.0, 0.0
 
 
 @inner
-def window(from_side_m, from_sill_m, u, v, bay, floor, lamps):
-    """Glass with a frame; some are lit when it gets dark, some have curtains."""
+def window(from_side_m, from_sill_m, u, v, bay, floor, lit_share):
+    """Glass with a frame; some are lit when it gets dark, some have blinds. Values as those of `facade`."""
     if from_side_m < 0.07 or from_sill_m < 0.07 or abs(u - 0.5) < 0.012:
-        return 0.55, 0.55, 0.53, 0.0, 0.0
-    fate = hash01(bay, floor, 30)
-    light = 1.0 if lamps > 0 and fate < 0.4 else 0.0
+        return 0.55, 0.55, 0.53, 0.0, 0.0, 0.0
+    fate, warmth = hash01(bay, floor, 30), hash01(bay, floor, 46)
+    light = 0.0
+    if hash01(bay, floor, 47) < lit_share:
+        room = 0.55 + 0.45 * v - 0.5 * max(value_noise(7 * u + 9 * warmth, 4 * v, bay) - 0.45, 0.0)  # lamps hang high
+        light = room * (0.2 + 0.8 * warmth * warmth)
     if fate > 0.6 and v > 0.35 + 0.4 * hash01(bay, floor, 31):  # blinds, drawn to some height
-        return 0.42, 0.40, 0.36, 0.08, 0.5 * light
+        return 0.42, 0.40, 0.36, 0.08, 0.4 * light, warmth
     t = hash01(bay, floor, 32)
-    return 0.04 + 0.06 * t, 0.05 + 0.06 * t, 0.06 + 0.07 * t, 0.40, light
+    return 0.04 + 0.06 * t, 0.05 + 0.06 * t, 0.06 + 0.07 * t, 0.40, light, warmth
 
 
 @inner
