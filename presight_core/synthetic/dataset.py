@@ -103,9 +103,9 @@ class _Shooting:
     def take(self, shot: Shot) -> dict[int, tuple[float, float]]:
         """Render and write one image; returns pixels seen and pixels expected of each object in a keyframe."""
         plan, preset = self.plan, self.preset
-        x, y, _ = plan.pose(shot.time_s).tolist()
-        world_from_ego = plan.world_from_ego(shot.time_s)
-        world_from_ego[2, 3] = City.height_m(x, y)  # the car follows the ground, its recorded pose does not
+        x, y, yaw = plan.pose(shot.time_s).tolist()
+        # The car follows the ground, its recorded pose does not.
+        world_from_ego = self.renderer.city.terrain.stand(x, y, yaw)
         camera = rig_camera(shot.mount, world_from_ego, preset.width_px, preset.height_px)
         actors = plan.traffic.actors(shot.time_s, np.array([x, y]))
         seed = (plan.noise_seed + 7919 * shot.moment + 101 * shot.mount.delay_us) % 2**31  # another grain each time
