@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from presight_core.classes import CITYSCAPES
-from presight_core.synthetic.ground import CURB_M, height_m
+from presight_core.synthetic.ground import CURB_M
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, Mesh, cylinder, face_normals, sphere
 
@@ -50,6 +50,7 @@ class Actor:
     yaw_rad: float
     colour: tuple[float, float, float]
     instance: int  # FIRST_ACTOR or more
+    ground_m: float = 0.0  # height of the road here
 
 
 @dataclass
@@ -88,7 +89,7 @@ def actor_mesh(actors: Sequence[Actor]) -> Mesh:
     faces = np.concatenate([part[1] + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32)
     counts = np.array([len(part[1]) for part in parts])
     ends = np.cumsum(counts)
-    centres = np.array([[a.x_m, a.y_m, KINDS[a.kind].height_m / 2] for a in actors])
+    centres = np.array([[a.x_m, a.y_m, a.ground_m + KINDS[a.kind].height_m / 2] for a in actors])
     radii = [[np.linalg.norm([KINDS[a.kind].length_m, KINDS[a.kind].width_m, 4]) / 2 + 0.3] for a in actors]
     return Mesh(
         vertices=vertices,
@@ -106,8 +107,7 @@ def actor_mesh(actors: Sequence[Actor]) -> Mesh:
 
 def foot_of(actor: Actor) -> NDArray[np.float64]:
     """Where an actor stands (3,), world metres."""
-    ground_m = float(height_m(actor.x_m, actor.y_m))
-    return np.array([actor.x_m, actor.y_m, ground_m + KINDS[actor.kind].foot_m])
+    return np.array([actor.x_m, actor.y_m, actor.ground_m + KINDS[actor.kind].foot_m])
 
 
 def _placed(actor: Actor) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:

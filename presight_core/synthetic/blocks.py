@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
 from presight_core.synthetic.buildings import FLOOR_M, Building, add_building
-from presight_core.synthetic.ground import CURB_M, drape, height_m
+from presight_core.synthetic.ground import CURB_M, Terrain
 from presight_core.synthetic.layers import polygons
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, MeshBuilder, Surface
@@ -26,6 +26,7 @@ class Site:
     builder: MeshBuilder
     rng: np.random.Generator
     style: CityStyle
+    terrain: Terrain
     trees: list[NDArray[np.float64]] = field(default_factory=list)  # (2,) each
     lamps: list[NDArray[np.float64]] = field(default_factory=list)  # (3,) light heads
     instance_count: int = 0
@@ -70,11 +71,11 @@ def _lay_ground(site: Site, block: Polygon, kind: str) -> None:
     above_m = CURB_M - 0.005  # reaches under the sidewalk, so that no gap shows between them
     block = block.buffer(0.05, join_style="mitre")
     if kind != "flats":
-        drape(site.builder, polygons(block), lawn, above_m)
+        site.terrain.drape(site.builder, polygons(block), lawn, above_m)
         return
     yard = block.buffer(-20)  # behind the buildings
-    drape(site.builder, polygons(block.difference(yard)), paving, above_m)
-    drape(site.builder, polygons(yard), lawn, above_m)
+    site.terrain.drape(site.builder, polygons(block.difference(yard)), paving, above_m)
+    site.terrain.drape(site.builder, polygons(yard), lawn, above_m)
 
 
 def _line_with_buildings(site: Site, block: Polygon, kind: str) -> list[Polygon]:
@@ -83,11 +84,11 @@ def _line_with_buildings(site: Site, block: Polygon, kind: str) -> list[Polygon]
     line = block.buffer(-plots.set_back, join_style="mitre")
     built: list[Polygon] = []
     for part in polygons(line):
-        corners = np.asarray(shapely.geometry.polygon.orient(part).exterior.simplify(1.0).coords)
+        corners = np.asarray(shapely.geometry.polygon.orient(part).exterior.simplify(0.6).coords)
         for start, end in itertools.pairwise(corners):
             for box in _plots_along(site.rng, plots, start, end):
                 plan = Polygon(box.vertices()[:4, :2])
-                if line.buffer(0.5).contains(plan) and not any(plan.intersects(other) for other in built):
+                if line.buffer(0.7).contains(plan) and not any(plan.intersects(other) for other in built):
                     built.append(plan.buffer(0.3))
                     _build(site, box, kind)
     return built
@@ -119,7 +120,7 @@ def _build(site: Site, box: Box, kind: str) -> None:
         height, has_shop = FLOOR_M * int(rng.integers(style.floors[0], style.floors[1] + 1)), rng.random() < 0.6
     else:
         height, has_shop = 3.0 * int(rng.integers(1, 3)) + 0.4, False
-    foot_m = float(height_m(box.x, box.y)) + 0.1
+    foot_m = site.terrain.lowest_m(box.vertices()[:4]) + 0.1
     pattern = 4 * int(rng.integers(0, 1000)) + 2 * is_brick + has_shop
     building = Building(
         box._replace(z=foot_m, height=float(height)),
@@ -144,7 +145,8 @@ def _border_gardens(site: Site, block: Polygon) -> None:
             while along_m + 4 < length_m:
                 panel_m = min(rng.uniform(5, 12), length_m - along_m)
                 x, y = start + (end - start) * (along_m + panel_m / 2) / length_m
-                _add_panel(site, Box(x, y, float(height_m(x, y)) + 0.1, panel_m, 0.1, 1.15, yaw_rad))
+                panel = Box(x, y, 0.0, panel_m, 0.1, 1.15, yaw_rad)
+                _add_panel(site, panel._replace(z=site.terrain.lowest_m(panel.vertices()) + 0.1))
                 along_m += panel_m + rng.uniform(1.2, 3)
 
 

@@ -11,7 +11,7 @@ from presight_core.synthetic.blocks import Site, fill_block
 from presight_core.synthetic.buildings import Building, add_building
 from presight_core.synthetic.furniture import furnish_streets
 from presight_core.synthetic.graph import StreetGraph
-from presight_core.synthetic.ground import CURB_M, drape, height_m
+from presight_core.synthetic.ground import CURB_M, Terrain
 from presight_core.synthetic.layers import StreetLayers, lay_streets, polygons
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import Box, Mesh, MeshBuilder, Surface
@@ -27,6 +27,7 @@ class City:
 
     graph: StreetGraph
     layers: StreetLayers
+    terrain: Terrain
     mesh: Mesh
     lamps: NDArray[np.float64]  # (L, 3) light heads of the street lamps
 
@@ -35,9 +36,10 @@ class City:
         self.style = style or CityStyle()
         rng = np.random.default_rng(seed)
         style = self.style
-        self.graph = StreetGraph(rng, style.size_m, style.spacing_m, style.margin_m, style.left_hand)
-        self.layers = lay_streets(self.graph, style.size_m)
-        site = Site(MeshBuilder(), rng, style)
+        self.graph = StreetGraph(rng, style)
+        self.layers = lay_streets(self.graph, style)
+        self.terrain = Terrain(seed, style.relief_m)
+        site = Site(MeshBuilder(), rng, style, self.terrain)
         _lay_surfaces(site, self.layers)
         for block in self.layers.blocks:
             fill_block(site, block)
@@ -47,38 +49,38 @@ class City:
         self.mesh = site.builder.build(CHUNK_M)
         self.lamps = np.array(site.lamps).reshape(-1, 3)
 
-    @staticmethod
-    def height_m(x_m: float, y_m: float) -> float:
+    def height_m(self, x_m: float, y_m: float) -> float:
         """Height of the road surface at a place."""
-        return float(height_m(x_m, y_m))
+        return float(self.terrain.height_m(x_m, y_m))
 
 
 def _lay_surfaces(site: Site, layers: StreetLayers) -> None:
-    builder, size_m = site.builder, site.style.size_m
-    drape(builder, layers.drivable, Surface(Material.ASPHALT, site.style.asphalt), 0.0)
-    drape(builder, layers.walkway, Surface(Material.PAVING, (0.42, 0.40, 0.38)), CURB_M)
+    builder, terrain, size_m = site.builder, site.terrain, site.style.size_m
+    terrain.drape(builder, layers.drivable, Surface(Material.ASPHALT, site.style.asphalt), 0.0)
+    terrain.drape(builder, layers.walkway, Surface(Material.PAVING, (0.42, 0.40, 0.38)), CURB_M)
     paint_m = 0.012  # above the asphalt; the waves cannot swallow it
-    drape(builder, layers.white_paint, Surface(Material.WHITE_PAINT, (0.72, 0.72, 0.70)), paint_m)
-    drape(builder, layers.yellow_paint, Surface(Material.YELLOW_PAINT, (0.74, 0.50, 0.08)), paint_m)
+    terrain.drape(builder, layers.white_paint, Surface(Material.WHITE_PAINT, (0.72, 0.72, 0.70)), paint_m)
+    terrain.drape(builder, layers.yellow_paint, Surface(Material.YELLOW_PAINT, (0.74, 0.50, 0.08)), paint_m)
     for polygon in layers.drivable:
         for ring in (polygon.exterior, *polygon.interiors):
-            _add_curb(builder, np.asarray(shapely.segmentize(ring, 10.0).coords))
+            _add_curb(site, np.asarray(shapely.segmentize(ring, terrain.cell_m).coords))
     underlay = Surface(Material.FAR_GROUND, (0.25, 0.25, 0.22))
-    drape(builder, [shapely.box(0, 0, size_m, size_m)], underlay, -0.1)  # shows where two layers do not quite meet
+    square = shapely.box(0, 0, size_m, size_m)
+    terrain.drape(builder, [square], underlay, -0.1)  # shows where two layers do not quite meet
     far = shapely.box(-HORIZON_M, -HORIZON_M, size_m + HORIZON_M, size_m + HORIZON_M)
-    plain = far.difference(shapely.box(0, 0, size_m, size_m))
+    plain = far.difference(square)
     coarse_m = 300.0  # nobody drives there
-    drape(builder, polygons(plain), Surface(Material.FAR_GROUND, (0.24, 0.28, 0.16)), 0.1, coarse_m)
+    terrain.drape(builder, polygons(plain), Surface(Material.FAR_GROUND, (0.24, 0.28, 0.16)), 0.1, coarse_m)
 
 
-def _add_curb(builder: MeshBuilder, ring: NDArray[np.float64]) -> None:
+def _add_curb(site: Site, ring: NDArray[np.float64]) -> None:
     """The curb's face along the edge of the road."""
-    ground_m = height_m(ring[:, 0], ring[:, 1])
+    ground_m = site.terrain.height_m(ring[:, 0], ring[:, 1])
     count = len(ring)
     vertices = np.r_[np.c_[ring, ground_m - 0.05], np.c_[ring, ground_m + CURB_M + 0.005]]
     i = np.arange(count - 1)
     faces = np.r_[np.c_[i, i + 1, i + 1 + count], np.c_[i, i + 1 + count, i + count]]
-    builder.add(vertices, faces, Surface(Material.CURB, (0.50, 0.49, 0.47)))
+    site.builder.add(vertices, faces, Surface(Material.CURB, (0.50, 0.49, 0.47)))
 
 
 def _raise_skyline(site: Site) -> None:
@@ -89,7 +91,7 @@ def _raise_skyline(site: Site) -> None:
         x, y = size_m / 2 + distance * np.cos(angle), size_m / 2 + distance * np.sin(angle)
         length, width = rng.uniform(22, 60, 2)
         height = rng.uniform(12, 40) + 0.06 * distance * rng.random()
-        box = Box(x, y, 0.05, length, width, height, rng.uniform(0, np.pi))
+        box = Box(x, y, -site.style.relief_m, length, width, height, rng.uniform(0, np.pi))
         wall = site.style.walls[int(rng.integers(len(site.style.walls)))]
         building = Building(box, wall, 4 * int(rng.integers(1000)), site.next_instance(), "distant")
         add_building(site.builder, rng, building)

@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from presight_core.synthetic.blocks import Site
-from presight_core.synthetic.graph import Edge, Line, StreetGraph
-from presight_core.synthetic.ground import height_m
+from presight_core.synthetic.graph import CROSSING_DEPTH_M, STOP_LINE_GAP_M, Crossing, Edge, StreetGraph
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, Surface, cylinder
 
@@ -21,38 +20,43 @@ def furnish_streets(site: Site, graph: StreetGraph) -> None:
 
 def _furnish(site: Site, graph: StreetGraph, edge: Edge) -> None:
     rng, (a, b) = site.rng, edge
-    line, curb_m = graph.line(a, b), graph.half_width_m(a, b)
-    first, last = graph.mouth_m(a) + 6, line.length_m - graph.mouth_m(b) - 6  # 6: keep crossings clear
+    street, curb_m = graph.street(a, b), graph.half_width_m(a, b)
+    first, last = graph.mouth_m(a) + 6, street.length_m - graph.mouth_m(b) - 6
+    crossed = [crossing.middle_m for crossing in graph.crossings(a, b)]
+
+    def free(along_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Without the places that would hide a crossing."""
+        return along_m[[all(abs(place - middle) > 4.5 for middle in crossed) for place in along_m]]
+
     is_leafy = rng.random() < site.style.leafy_share
     for side in (-1, 1):
-        for along_m in np.arange(first + rng.uniform(0, 8), last, 12.0):
+        for along_m in free(np.arange(first + rng.uniform(0, 8), last, 12.0)):
             if is_leafy and rng.random() < 0.85:
-                site.trees.append(line.at(along_m, side * (curb_m + 1.0)))
-        for along_m in np.arange(first + (5 if side > 0 else 18), last, 28.0):  # lamps stand staggered
-            _add_lamp(site, line.at(along_m, side * (curb_m + 0.5)), -side * line.left)
-        for along_m in rng.uniform(first, max(last, first + 1), 3):
-            _add_sign(site, line.at(along_m, side * (curb_m + 0.45)), -side * graph.drive_side * line.tangent)
-    _add_signals(site, graph, line, edge)
+                site.trees.append(street.at(along_m, side * (curb_m + 1.0)))
+        for along_m in free(np.arange(first + (5 if side > 0 else 18), last, 28.0)):  # lamps stand staggered
+            _add_lamp(site, street.at(along_m, side * (curb_m + 0.5)), -side * street.left_at(along_m))
+        for along_m in free(rng.uniform(first, max(last, first + 1), 3)):
+            facing = -side * graph.drive_side * street.tangent_at(along_m)
+            _add_sign(site, street.at(along_m, side * (curb_m + 0.45)), facing)
+    for crossing in graph.crossings(a, b):
+        _add_signals(site, graph, edge, crossing)
 
 
-def _add_signals(site: Site, graph: StreetGraph, line: Line, edge: Edge) -> None:
+def _add_signals(site: Site, graph: StreetGraph, edge: Edge, crossing: Crossing) -> None:
     """Traffic lights at the stop lines, on the drivers' side of the street."""
-    curb_m = graph.half_width_m(*edge)
-    for node, along_m, into in (
-        (edge[0], graph.mouth_m(edge[0]), 1),
-        (edge[1], line.length_m - graph.mouth_m(edge[1]), -1),
-    ):
-        if graph.is_junction(node):
-            inward = graph.drive_side * into * line.left  # from the incoming drivers' curb over their lane
-            foot = line.at(along_m + 3.9 * into, 0) - inward * (curb_m + 0.5)  # 3.9: beside the stop line
-            _add_traffic_light(site, foot, into * line.tangent, inward)
+    street, curb_m = graph.street(*edge), graph.half_width_m(*edge)
+    for direction in crossing.stops:
+        along_m = crossing.middle_m - direction * (CROSSING_DEPTH_M / 2 + STOP_LINE_GAP_M)
+        inward = -graph.drive_side * direction * street.left_at(along_m)  # from the drivers' curb over their lane
+        foot = street.at(along_m) - inward * (curb_m + 0.5)
+        _add_traffic_light(site, foot, -direction * street.tangent_at(along_m), inward)
 
 
 def _add_post(site: Site, foot: NDArray[np.float64], size_m: tuple[float, float], surface: Surface) -> float:
     """An upright post of (radius, height); returns the ground's height at its foot."""
     vertices, faces = cylinder(6)
     radius_m, height = size_m
-    ground_m = float(height_m(*foot))
+    ground_m = float(site.terrain.height_m(*foot))
     site.builder.add(vertices * [radius_m, radius_m, height] + [*foot, ground_m], faces, surface)
     return ground_m
 

@@ -9,32 +9,72 @@ from numpy.typing import ArrayLike, NDArray
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
+from presight_core.frames import transform
 from presight_core.synthetic.layers import polygons
 from presight_core.synthetic.mesh import MeshBuilder, Surface
 
 CURB_M = 0.15  # sidewalks stand this far above the road
-CELL_M = 20.0  # triangles this size follow the waves to 2 mm
+SAG_M = 0.004  # triangles follow the waves as closely as this, a third of the height of paint above asphalt
+WAVE_COUNT = 4
+LARGEST_CELL_M = 40.0  # also what lies on flat ground is cut, for culling
 
 
-def height_m(x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
-    """Height of the road surface, within 6 cm of zero.
+class Terrain:
+    """The height of a city's road surface: gentle waves around zero, of a total amplitude `relief_m`.
 
-    Ego poses say z = 0 everywhere, as nuScenes does, while the car follows the ground: a real error of a few
-    centimetres between drives that mapping has to bear. Waves of 300 to 500 m keep it smooth along a drive.
+    Ego poses say z = 0 everywhere, as nuScenes does, while the car follows the ground: a real error between drives
+    that mapping has to bear. Wave lengths of 250 to 500 m keep it smooth along a drive.
     """
-    x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
-    return 0.035 * np.sin(x / 61 + 1.3) * np.cos(y / 47 + 0.4) + 0.025 * np.sin((x + y) / 83)
 
+    def __init__(self, seed: int, relief_m: float):
+        rng = np.random.default_rng([seed, 3])  # a stream of its own: relief changes nothing else of a city
+        shares = rng.uniform(0.5, 1, WAVE_COUNT)
+        self._amplitudes_m = relief_m * shares / shares.sum()
+        bearings, lengths_m = rng.uniform(0, 2 * np.pi, WAVE_COUNT), rng.uniform(250, 500, WAVE_COUNT)
+        self._waves = 2 * np.pi / lengths_m[:, None] * np.c_[np.cos(bearings), np.sin(bearings)]  # (4, 2) radians/m
+        self._phases = rng.uniform(0, 2 * np.pi, WAVE_COUNT)
 
-def drape(
-    builder: MeshBuilder, shapes: Iterable[Polygon], surface: Surface, above_m: float, cell_m: float = CELL_M
-) -> None:
-    """Lay polygons this far above the ground, cut into cells so that they follow it."""
-    for shape in shapes:
-        for part in _cells(shape, cell_m):
-            vertices, faces = triangulate(part)
-            heights = height_m(vertices[:, 0], vertices[:, 1]) + above_m
-            builder.add(np.c_[vertices, heights], faces, surface)
+    def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
+        """Height of the road surface at places (...,)."""
+        return np.sin(self._angles(x_m, y_m)) @ self._amplitudes_m
+
+    def lowest_m(self, points: NDArray[np.float64]) -> float:
+        """The least height at any of the points (N, 2)."""
+        return float(self.height_m(points[:, 0], points[:, 1]).min())
+
+    def stand(self, x_m: float, y_m: float, yaw_rad: float) -> NDArray[np.float64]:
+        """world_from_ego (4, 4) of a car on the ground: it pitches and rolls with the slope."""
+        slope_x, slope_y = (np.cos(self._angles(x_m, y_m)) * self._amplitudes_m) @ self._waves
+        heading = np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0.0])
+        heading[2] = heading[0] * slope_x + heading[1] * slope_y
+        up = np.array([-slope_x, -slope_y, 1.0])
+        forward, up = heading / np.linalg.norm(heading), up / np.linalg.norm(up)
+        place = [x_m, y_m, float(self.height_m(x_m, y_m))]
+        return transform(np.stack([forward, np.cross(up, forward), up], -1), place)
+
+    def drape(
+        self,
+        builder: MeshBuilder,
+        shapes: Iterable[Polygon],
+        surface: Surface,
+        above_m: float,
+        cell_m: float | None = None,
+    ) -> None:
+        """Lay polygons this far above the ground, cut into cells so that they follow it."""
+        for shape in shapes:
+            for part in _cells(shape, cell_m or self.cell_m):
+                vertices, faces = triangulate(part)
+                heights = self.height_m(vertices[:, 0], vertices[:, 1]) + above_m
+                builder.add(np.c_[vertices, heights], faces, surface)
+
+    @property
+    def cell_m(self) -> float:
+        """Edge of squares whose triangles deviate from the waves by less than SAG_M."""
+        bend = float((self._amplitudes_m * (self._waves**2).sum(1)).sum())  # the largest curvature, 1/m
+        return float(min(np.sqrt(8 * SAG_M / max(bend, 1e-12) / 2), LARGEST_CELL_M))  # sagitta over a diagonal
+
+    def _angles(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
+        return np.stack([np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)], -1) @ self._waves.T + self._phases
 
 
 def triangulate(polygon: Polygon) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -51,7 +91,7 @@ def triangulate(polygon: Polygon) -> tuple[NDArray[np.float64], NDArray[np.int64
 
 def _cells(shape: BaseGeometry, cell_m: float) -> list[Polygon]:
     low_x, low_y, high_x, high_y = shape.bounds
-    if max(high_x - low_x, high_y - low_y) <= 1.5 * cell_m:
+    if max(high_x - low_x, high_y - low_y) <= cell_m:
         return polygons(shape)
     cells = []
     for x in np.arange(np.floor(low_x / cell_m), np.ceil(high_x / cell_m)) * cell_m:

@@ -9,11 +9,18 @@ from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
-from presight_core.synthetic.graph import LANE_WIDTH_M, Edge, Line, StreetGraph
+from presight_core.synthetic.graph import (
+    CROSSING_DEPTH_M,
+    LANE_WIDTH_M,
+    STOP_LINE_DEPTH_M,
+    STOP_LINE_GAP_M,
+    Crossing,
+    Edge,
+    StreetGraph,
+)
+from presight_core.synthetic.street import Street
+from presight_core.synthetic.style import CityStyle
 
-WALKWAY_WIDTH_M = 3.2
-CROSSING_DEPTH_M = 3.2
-STOP_LINE_GAP_M = 1.2  # between crossing and stop line
 SNAP_M = 0.03  # curves lose vertices closer to a chord than this; far below a pixel
 
 
@@ -25,8 +32,9 @@ class Lane:
     number: int  # 0: next to the street's axis
     forward: bool  # drives from edge[0] to edge[1]
     polygon: Polygon
-    left: NDArray[np.float64]  # (2, 2)
-    right: NDArray[np.float64]  # (2, 2)
+    left: NDArray[np.float64]  # (N, 2)
+    right: NDArray[np.float64]  # (N, 2)
+    centre: NDArray[np.float64]  # (N, 2)
 
 
 @dataclass
@@ -54,23 +62,30 @@ def polygons(geometry: BaseGeometry) -> list[Polygon]:
     return [part for part in shapely.get_parts(geometry) if isinstance(part, Polygon) and part.area > 1e-4]
 
 
-def lay_streets(graph: StreetGraph, size_m: float) -> StreetLayers:
+def lay_streets(graph: StreetGraph, style: CityStyle) -> StreetLayers:
     """All street layers of a graph on a square map."""
-    streets = [LineString(graph.nodes[list(edge)]).buffer(graph.half_width_m(*edge)) for edge in graph.edges]
+    streets = [LineString(graph.street(*edge).points).buffer(graph.half_width_m(*edge)) for edge in graph.edges]
     corner_m = 5.0  # curb radius at junctions
     road = unary_union(streets).buffer(corner_m, quad_segs=6).buffer(-corner_m, quad_segs=6).simplify(SNAP_M)
-    with_walkway = road.buffer(WALKWAY_WIDTH_M, join_style="mitre")
+    with_walkway = road.buffer(style.sidewalk_m, join_style="mitre")
     layers = StreetLayers(
         road=road,
         drivable=polygons(road),
         walkway=polygons(with_walkway.difference(road).simplify(SNAP_M)),
-        blocks=_blocks(shapely.box(0, 0, size_m, size_m).difference(with_walkway)),
+        blocks=_blocks(shapely.box(0, 0, style.size_m, style.size_m).difference(with_walkway)),
     )
     for edge in graph.edges:
-        _lay_street(layers, graph, edge)
-    between = road.difference(unary_union([polygon for polygon, _ in layers.segments]).buffer(0.01))
+        _lay_street(layers, graph, style, edge)
+    between = road.difference(unary_union([_strip(graph, edge, 0.3) for edge in graph.edges]))  # 0.3: up to any curb
     layers.intersections = [polygon for polygon in polygons(between) if polygon.area > 30]  # less: a rounded corner
     return layers
+
+
+def _strip(graph: StreetGraph, edge: Edge, margin_m: float = 0.0) -> Polygon:
+    """A street between its mouths, from curb to curb."""
+    a, b = edge
+    half, street = graph.half_width_m(a, b) + margin_m, graph.street(a, b)
+    return Polygon(street.strip((graph.mouth_m(a), street.length_m - graph.mouth_m(b)), (-half, half)))
 
 
 def _blocks(ground: BaseGeometry) -> list[Polygon]:
@@ -88,75 +103,71 @@ def _blocks(ground: BaseGeometry) -> list[Polygon]:
     return blocks
 
 
-def _lay_street(layers: StreetLayers, graph: StreetGraph, edge: Edge) -> None:
-    a, b = edge
-    line, half_width = graph.line(a, b), graph.half_width_m(a, b)
-    first, last = graph.mouth_m(a), line.length_m - graph.mouth_m(b)
-    layers.segments.append((Polygon(line.strip((first, last), (-half_width, half_width))), edge))
-    if graph.is_junction(a):
-        incoming = (-graph.drive_side * half_width, 0.0)  # lanes that arrive at a
-        first = _lay_crossing(layers, line, edge, (first, 1), half_width, incoming)
-    if graph.is_junction(b):
-        incoming = (0.0, graph.drive_side * half_width)
-        last = _lay_crossing(layers, line, edge, (last, -1), half_width, incoming)
-    layers.road_dividers.append((np.stack([line.at(first, 0), line.at(last, 0)]), edge))
-    for left_m in (-0.16, 0.16):  # a double line
-        layers.yellow_paint.append(Polygon(line.strip((first, last), (left_m - 0.07, left_m + 0.07))))
+def _lay_street(layers: StreetLayers, graph: StreetGraph, style: CityStyle, edge: Edge) -> None:
+    layers.segments.append((_strip(graph, edge), edge))
+    for crossing in graph.crossings(*edge):
+        _lay_crossing(layers, graph, edge, crossing)
+    street, spans = graph.street(*edge), graph.free_spans_m(*edge)
+    axis = layers.yellow_paint if style.is_axis_yellow else layers.white_paint
+    for span in spans:
+        layers.road_dividers.append((street.beside(span, 0.0), edge))
+        if style.is_axis_dashed and graph.lanes(*edge) == 1:
+            axis += _dashes(street, span, 0.0)
+        else:
+            axis += [Polygon(street.strip(span, (left - 0.07, left + 0.07))) for left in (-0.16, 0.16)]  # double
     for side in (-1, 1):
-        _lay_lanes(layers, graph, edge, side, (first, last))
+        _lay_lanes(layers, graph, edge, side)
+        for span in spans:
+            if graph.lanes(*edge) == 1:
+                _lay_parking(layers, graph, edge, side, span)
 
 
-def _lay_crossing(
-    layers: StreetLayers,
-    line: Line,
-    edge: Edge,
-    mouth: tuple[float, int],  # where the street begins, and the direction into it
-    half_width: float,
-    incoming: tuple[float, float],  # across: the lanes that must stop
-) -> float:
-    """Zebra and stop line at one mouth of a street; returns where lane markings may begin."""
-    start, into = mouth
-    end = start + CROSSING_DEPTH_M * into
-    layers.crossings.append((Polygon(line.strip((start, end), (0.2 - half_width, half_width - 0.2))), edge))
-    for left_m in np.arange(0.6 - half_width, half_width - 0.6, 1.0):  # bars of half a metre
-        layers.white_paint.append(Polygon(line.strip((start, end), (left_m, left_m + 0.5))))
-    stop = end + STOP_LINE_GAP_M * into
-    low, high = sorted(incoming)
-    stop_line = Polygon(line.strip((stop, stop + 0.35 * into), (low + 0.2, high - 0.2)))
-    layers.stop_lines.append((stop_line, edge))
-    layers.white_paint.append(stop_line)
-    return stop + 0.35 * into
+def _dashes(street: Street, span_m: tuple[float, float], left_m: float) -> list[Polygon]:
+    starts = np.arange(span_m[0] + 1, span_m[1] - 3, 6.0)  # 3 m dashes, 3 m gaps
+    return [Polygon(street.strip((s, s + 3), (left_m - 0.07, left_m + 0.07))) for s in starts]
 
 
-def _lay_lanes(layers: StreetLayers, graph: StreetGraph, edge: Edge, side: int, along_m: tuple[float, float]) -> None:
-    """Lanes, dividers and parking bays on one side (+1: left of the edge's direction)."""
-    line, count = graph.line(*edge), graph.lanes(*edge)
+def _lay_crossing(layers: StreetLayers, graph: StreetGraph, edge: Edge, crossing: Crossing) -> None:
+    """Zebra and stop lines."""
+    street, half = graph.street(*edge), graph.half_width_m(*edge)
+    along = crossing.middle_m - CROSSING_DEPTH_M / 2, crossing.middle_m + CROSSING_DEPTH_M / 2
+    layers.crossings.append((Polygon(street.strip(along, (0.2 - half, half - 0.2))), edge))
+    for left_m in np.arange(0.6 - half, half - 0.6, 1.0):  # bars of half a metre
+        layers.white_paint.append(Polygon(street.strip(along, (left_m, left_m + 0.5))))
+    for direction in crossing.stops:
+        front = crossing.middle_m - direction * (CROSSING_DEPTH_M / 2 + STOP_LINE_GAP_M)
+        back = front - direction * STOP_LINE_DEPTH_M
+        low, high = sorted((0.0, direction * graph.drive_side * half))
+        stop_line = Polygon(street.strip((back, front), (low + 0.2, high - 0.2)))
+        layers.stop_lines.append((stop_line, edge))
+        layers.white_paint.append(stop_line)
+
+
+def _lay_lanes(layers: StreetLayers, graph: StreetGraph, edge: Edge, side: int) -> None:
+    """Lanes and their dividers on one side (+1: left of the edge's direction)."""
+    street, along_m = graph.street(*edge), graph.lane_span_m(*edge)
     forward = side == graph.drive_side
-    run = along_m if forward else along_m[::-1]
-    for number in range(count):
-        inner, outer = side * LANE_WIDTH_M * number, side * LANE_WIDTH_M * (number + 1)
-        edges = [np.stack([line.at(s, across) for s in run]) for across in (inner, outer)]
-        left, right = edges if graph.drive_side < 0 else edges[::-1]
-        polygon = Polygon(line.strip(along_m, (inner, outer)))
-        layers.lanes.append(Lane(edge, number, forward, polygon, left, right))
+    run = along_m if forward else (along_m[1], along_m[0])
+    for number in range(graph.lanes(*edge)):
+        inner, centre, outer = (side * LANE_WIDTH_M * (number + share) for share in (0, 0.5, 1))
+        lines = [street.beside(run, across) for across in (inner, outer)]
+        left, right = lines if graph.drive_side < 0 else lines[::-1]
+        polygon = Polygon(street.strip(along_m, (inner, outer)))
+        layers.lanes.append(Lane(edge, number, forward, polygon, left, right, street.beside(run, centre)))
         if number > 0:
-            layers.lane_dividers.append((np.stack([line.at(s, inner) for s in along_m]), edge))
-            for s in np.arange(along_m[0] + 1, along_m[1] - 3, 6.0):  # 3 m dashes, 3 m gaps
-                layers.white_paint.append(Polygon(line.strip((s, s + 3), (inner - 0.07, inner + 0.07))))
-    if count == 1:
-        _lay_parking(layers, line, edge, side, along_m, forward)
+            for span in graph.free_spans_m(*edge):
+                layers.lane_dividers.append((street.beside(span, inner), edge))
+                layers.white_paint += _dashes(street, span, inner)
 
 
-def _lay_parking(
-    layers: StreetLayers, line: Line, edge: Edge, side: int, along_m: tuple[float, float], forward: bool
-) -> None:
-    """The line that divides lane and bays, ticks between the bays, and where cars stand."""
-    border = side * LANE_WIDTH_M
-    layers.lane_dividers.append((np.stack([line.at(s, border) for s in along_m]), edge))
-    layers.white_paint.append(Polygon(line.strip(along_m, (border - 0.06, border + 0.06))))
-    yaw_rad = line.yaw_rad + (0.0 if forward else np.pi)
+def _lay_parking(layers: StreetLayers, graph: StreetGraph, edge: Edge, side: int, span_m: tuple[float, float]) -> None:
+    """Marks shaped like a T between the bays, and where cars stand. No line divides the bays from the lane."""
+    street, border = graph.street(*edge), side * LANE_WIDTH_M
+    turn_rad = 0.0 if side == graph.drive_side else np.pi
     bay_m = 6.2
-    for s in np.arange(along_m[0] + 3, along_m[1] - bay_m, bay_m):
-        layers.white_paint.append(Polygon(line.strip((s - 0.05, s + 0.05), (border, border + side * 2.0))))
-        x, y = line.at(s + bay_m / 2, border + side * 1.15)
-        layers.parking.append((float(x), float(y), float(yaw_rad)))
+    starts = np.arange(span_m[0] + 3, span_m[1] - bay_m, bay_m)
+    for s in starts:
+        layers.white_paint.append(Polygon(street.strip((s - 0.06, s + 0.06), (border, border + side * 1.0))))
+        layers.white_paint.append(Polygon(street.strip((s - 0.45, s + 0.45), (border, border - side * 0.12))))
+        x, y = street.at(s + bay_m / 2, border + side * 1.15)
+        layers.parking.append((float(x), float(y), street.yaw_at(s + bay_m / 2) + turn_rad))

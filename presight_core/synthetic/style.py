@@ -28,6 +28,11 @@ class CityStyle:
     walls: tuple[Colour, ...] = BRICK + RENDER + CONCRETE
     asphalt: Colour = (0.20, 0.20, 0.21)
     foliage: Colour = (0.13, 0.24, 0.07)
+    bend_m: float = 9.0  # streets swing sideways by up to this; 0: a straight grid
+    relief_m: float = 0.06  # height of the ground's waves; 0.5 brings slopes of a hundredth
+    sidewalk_m: float = 3.2  # width
+    is_axis_yellow: bool = True  # the line between the two directions; otherwise white
+    is_axis_dashed: bool = False  # on streets with one lane a direction; otherwise a double line
 
     @staticmethod
     def random(rng: np.random.Generator, size_m: float = 340.0) -> "CityStyle":

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from presight_core.synthetic.actors import FIRST_ACTOR, KINDS, Actor
 from presight_core.synthetic.city import City
 from presight_core.synthetic.graph import follow
+from presight_core.synthetic.ground import Terrain
 from presight_core.synthetic.style import Density
 
 REACH_M = 130.0  # actors farther from the ego than this are not drawn
@@ -46,6 +47,7 @@ class Traffic:
     """Everybody on the streets during one drive."""
 
     tracks: tuple[Track, ...]
+    terrain: Terrain
 
     def actors(self, time_s: float, near: NDArray[np.float64]) -> list[Actor]:
         """Who is within reach of a place (2,) at a moment."""
@@ -54,7 +56,8 @@ class Traffic:
         for track in self.tracks:
             x, y, yaw = (track.poses(moment) if track.is_moving else track.path)[0].tolist()
             if np.hypot(x - near[0], y - near[1]) < REACH_M:
-                found.append(Actor(track.kind, x, y, yaw, track.colour, track.instance))
+                ground_m = float(self.terrain.height_m(x, y))
+                found.append(Actor(track.kind, x, y, yaw, track.colour, track.instance, ground_m))
         return found
 
 
@@ -73,7 +76,7 @@ def plan_traffic(
         planner.drive(kind)
     for _ in range(density.pedestrians):
         planner.walk()
-    return Traffic(tuple(planner.tracks))
+    return Traffic(tuple(planner.tracks), city.terrain)
 
 
 class _Planner:
@@ -147,14 +150,13 @@ class _Planner:
         near = [edge for edge in graph.edges if self._is_near(graph.nodes[list(edge)].mean(0))] or graph.edges
         edge = near[int(rng.integers(len(near)))]
         path = edge if rng.random() < 0.5 else edge[::-1]
-        line = graph.line(*path)
+        street = graph.street(*path)
         side = int(rng.choice([-1, 1]))
         across = side * (graph.half_width_m(*edge) + rng.uniform(1.5, 2.8))
-        first, last = graph.mouth_m(path[0]) + 2, line.length_m - graph.mouth_m(path[1]) - 2
+        first, last = graph.mouth_m(path[0]) + 2, street.length_m - graph.mouth_m(path[1]) - 2
         clothes = rng.uniform(0.03, 0.6, 3)
         colour = (float(clothes[0]), float(clothes[1]), float(clothes[2]))
-        along = np.arange(first, last, 0.5)[:, None]
-        points = line.origin + along * line.tangent + across * line.left
+        points = street.at(np.arange(first, last, 0.5), across)
         speed = float(rng.uniform(0.9, 1.6))
         room_m = (last - first) - 3 - speed * self.times[-1]
         if room_m > 0 and rng.random() < 0.75:

@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from presight_core.synthetic.blocks import Site
-from presight_core.synthetic.ground import height_m
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import Surface, cylinder, sphere
 
@@ -19,7 +18,7 @@ def plant_trees(site: Site) -> None:
     trunk_vertices, trunk_faces = cylinder(6)
     for spot in site.trees:
         instance = site.next_instance()
-        foot_m = float(height_m(*spot)) + 0.1
+        foot_m = float(site.terrain.height_m(*spot)) + 0.1
         trunk_m, radius_m = rng.uniform(1.9, 3.0), rng.uniform(1.4, 2.5)
         bark = Surface(Material.TRUNK, (0.22, 0.16, 0.11), instance)
         trunk = trunk_vertices * [0.07 * radius_m, 0.07 * radius_m, trunk_m + 0.8 * radius_m] + [*spot, foot_m]

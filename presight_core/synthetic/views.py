@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from presight_core.cameras import Camera
-from presight_core.frames import planar_transform
 from presight_core.synthetic.actors import Actor
 from presight_core.synthetic.city import City
 from presight_core.synthetic.graph import follow
@@ -29,12 +28,10 @@ def random_view(city: City, rng: np.random.Generator, width_px: int = 400, light
     route = graph.route(graph.random_path(rng, int(rng.integers(len(graph.nodes))), 4), lane=int(rng.integers(2)))
     pose = follow(route, np.array([rng.uniform(0, len(route) / 2 - 3)]))
     x, y, yaw = pose[0].tolist()
-    world_from_ego = planar_transform(x, y, yaw)
-    world_from_ego[2, 3] = city.height_m(x, y)
     traffic = plan_traffic(city, rng, pose, duration_s=0.0)
     kind = light or str(rng.choice(KINDS))
     return View(
-        cameras=rig_cameras(world_from_ego, width_px, width_px * 9 // 16),
+        cameras=rig_cameras(city.terrain.stand(x, y, yaw), width_px, width_px * 9 // 16),
         lighting=sample_lighting(kind, rng),
         actors=tuple(traffic.actors(0.0, pose[0, :2])),
     )

@@ -1,14 +1,22 @@
 """The procedural city: its streets, its mesh, its traffic."""
 
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from shapely import Point
+from shapely import LineString, Point, Polygon, STRtree
 from shapely.ops import unary_union
 
 from presight_core.classes import CITYSCAPES
+from presight_core.frames import is_rigid
 from presight_core.synthetic.actors import KINDS, Actor, actor_mesh, foot_of
 from presight_core.synthetic.city import City
 from presight_core.synthetic.graph import ROUTE_STEP_M, follow
+from presight_core.synthetic.materials import Material
+from presight_core.synthetic.mesh import Mesh
+from presight_core.synthetic.street import RADIUS_M
 from presight_core.synthetic.style import CityStyle
 from presight_core.synthetic.traffic import plan_traffic
 
@@ -57,9 +65,10 @@ def test_the_ground_undulates_by_centimetres_only(city: City):
 def test_traffic_keeps_to_its_side_of_the_road(left_hand: bool):
     graph = City(seed=1, style=CityStyle(size_m=200.0, spacing_m=90.0, left_hand=left_hand)).graph
     a, b = graph.edges[0]
-    line = graph.line(a, b)
+    street = graph.street(a, b)
     middle = graph.route([a, b])[len(graph.route([a, b])) // 2]
-    left_m = float((middle - line.origin) @ line.left)
+    nearest_m = street.along_m[np.argmin(np.linalg.norm(street.points - middle, axis=1))]
+    left_m = float((middle - street.at(nearest_m)) @ street.left_at(nearest_m))
     assert (left_m > 0) == left_hand
 
 
@@ -81,7 +90,6 @@ def test_lanes_crossings_and_stop_lines_lie_on_the_road():
     layers = City(seed=1, style=CityStyle(size_m=260.0, spacing_m=75.0)).layers  # nine nodes: junctions at last
     road = layers.road.buffer(0.01)
     assert layers.crossings
-    assert len(layers.crossings) == len(layers.stop_lines)
     assert all(road.contains(polygon) for polygon, _ in layers.crossings + layers.stop_lines)
     assert all(road.contains(lane.polygon) for lane in layers.lanes)
 
@@ -107,12 +115,132 @@ def test_actors_fill_the_box_that_annotations_give_them(kind: str):
     np.testing.assert_allclose(size, box, rtol=0.15)
 
 
-def test_vehicles_stand_on_the_road_and_pedestrians_on_the_sidewalk(city: City):
-    ground_m = city.height_m(50, 60)
-    feet_m = [foot_of(Actor(kind, 50, 60, 0, (0.5, 0.5, 0.5), 1_000_000))[2] for kind in ("car", "pedestrian")]
-    np.testing.assert_allclose(np.array(feet_m) - ground_m, [0.02, 0.16])
+def test_vehicles_stand_on_the_road_and_pedestrians_on_the_sidewalk():
+    feet_m = [foot_of(Actor(kind, 50, 60, 0, (0.5, 0.5, 0.5), 1_000_000, 7.0))[2] for kind in ("car", "pedestrian")]
+    np.testing.assert_allclose(feet_m, [7.02, 7.16])
 
 
 def test_cyclists_carry_two_labels():
     mesh = actor_mesh([Actor("cyclist", 0.0, 0.0, 0.0, (0.5, 0.5, 0.5), 1_000_000)])
     assert {CITYSCAPES[label] for label in np.unique(mesh.labels)} == {"bicycle", "rider"}
+
+
+# ---- streets -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bent() -> City:
+    """Nine nodes: junctions, corners, bends, hills."""
+    return City(seed=4, style=CityStyle(size_m=330.0, spacing_m=110.0, relief_m=0.5))
+
+
+def test_streets_bend_but_never_tighter_than_their_least_radius(bent: City):
+    turns = []
+    for edge in bent.graph.edges:
+        street = bent.graph.street(*edge)
+        heading = np.unwrap(np.arctan2(street.tangents[:, 1], street.tangents[:, 0]))
+        turns.append(np.abs(np.diff(heading) / np.diff(street.along_m)).max())
+    assert max(turns) < 1 / RADIUS_M * 1.02
+    assert np.median(turns) > 1 / 200
+
+
+def test_streets_without_bends_are_straight():
+    street = City(seed=1, style=replace(SMALL, bend_m=0.0)).graph.street(0, 1)
+    assert len(street.beside((5, street.length_m - 5), 3.0)) == 2
+    assert len(street.strip((5, 50), (-2, 2))) == 4
+
+
+def test_a_street_seen_from_its_other_end_is_the_same_street(bent: City):
+    a, b = bent.graph.edges[0]
+    there, back = bent.graph.street(a, b), bent.graph.street(b, a)
+    np.testing.assert_allclose(there.at(20.0, 3.0), back.at(there.length_m - 20.0, -3.0), atol=1e-9)
+
+
+def test_places_beside_a_street_keep_their_distance_from_its_axis(bent: City):
+    street = bent.graph.street(*bent.graph.edges[0])
+    axis = LineString(street.points)
+    distances = [axis.distance(Point(point)) for point in street.beside((15, street.length_m - 15), 4.0)]
+    np.testing.assert_allclose(distances, 4.0, atol=0.02)
+
+
+def test_streets_touch_only_at_junctions(bent: City):
+    for (one, edge), (other, other_edge) in itertools.combinations(bent.layers.segments, 2):
+        assert one.distance(other) > 0.5, (edge, other_edge)
+
+
+def test_lanes_run_in_their_driving_direction_between_their_borders(bent: City):
+    for lane in bent.layers.lanes:
+        first, second = lane.centre[0], lane.centre[1]
+        across = lane.left[0] - lane.right[0]
+        step = second - first
+        assert step[0] * across[1] - step[1] * across[0] > 0, "left border lies to the right"
+        assert np.linalg.norm(across) == pytest.approx(3.4, abs=1e-6)
+        assert LineString(lane.centre).within(lane.polygon.buffer(0.01))
+
+
+def test_turns_join_the_lanes_that_meet_at_a_node(bent: City):
+    graph = bent.graph
+    lanes = {(lane.edge if lane.forward else lane.edge[::-1], lane.number): lane for lane in bent.layers.lanes}
+    for node, neighbours in graph.neighbours.items():
+        for a, b in itertools.permutations(neighbours, 2):
+            turn = graph.turn((a, node, b))
+            np.testing.assert_allclose(turn[0], lanes[(a, node), 0].centre[-1], atol=1e-6)
+            np.testing.assert_allclose(turn[-1], lanes[(node, b), 0].centre[0], atol=1e-6)
+            assert LineString(turn).within(bent.layers.road)
+
+
+def test_no_marking_divides_a_lane_from_the_parking_bays(bent: City):
+    for line, edge in bent.layers.lane_dividers:
+        assert bent.graph.lanes(*edge) == 2
+        axis = LineString(bent.graph.street(*edge).points)
+        assert axis.distance(Point(line[0])) == pytest.approx(3.4, abs=0.02)
+
+
+def test_even_a_single_block_has_crossings(city: City):
+    assert not any(city.graph.is_junction(node) for node in range(len(city.graph.nodes)))
+    assert city.layers.crossings
+    assert len(city.layers.stop_lines) == 2 * len(city.layers.crossings)
+
+
+# ---- ground ------------------------------------------------------------------------------------------------------
+
+
+def test_slopes_reach_a_hundredth_but_not_much_more(bent: City):
+    spots = np.random.default_rng(0).uniform(0, 330, (500, 2))
+    slopes = [np.linalg.norm(bent.terrain.stand(x, y, 0.0)[:2, 2]) for x, y in spots]
+    assert 0.004 < max(slopes) < 0.014
+
+
+def test_a_car_stands_square_on_the_slope(bent: City):
+    x, y, yaw, step = 120.0, 80.0, 0.7, 0.01
+    stand = bent.terrain.stand(x, y, yaw)
+    ahead = np.array([x, y]) + step * np.array([np.cos(yaw), np.sin(yaw)])
+    rise = (bent.height_m(*ahead) - bent.height_m(x, y)) / step
+    assert is_rigid(stand)
+    assert stand[2, 0] / np.linalg.norm(stand[:2, 0]) == pytest.approx(rise, abs=1e-5)
+    assert np.arctan2(stand[1, 0], stand[0, 0]) == pytest.approx(yaw, abs=1e-9)
+
+
+def test_paint_lies_clear_of_the_asphalt_on_any_slope(bent: City):
+    """Both surfaces are triangles: at random spots of the paint, its triangle is above the asphalt's."""
+    paint = _heights_under(bent.mesh, (Material.WHITE_PAINT, Material.YELLOW_PAINT))
+    asphalt = _heights_under(bent.mesh, (Material.ASPHALT,))
+    gaps = []
+    for polygon in (bent.layers.white_paint + bent.layers.yellow_paint)[::7]:
+        spot = polygon.representative_point()
+        gaps.append(paint(spot) - asphalt(spot))
+    assert len(gaps) > 50
+    assert min(gaps) > 0.006
+    assert max(gaps) < 0.018
+
+
+def _heights_under(mesh: Mesh, materials: tuple[Material, ...]) -> Callable[[Point], float]:
+    triangles = mesh.vertices[mesh.faces[np.isin(mesh.materials, materials)]].astype(np.float64)
+    tree = STRtree([Polygon(corners[:, :2]) for corners in triangles])
+
+    def height_m(spot: Point) -> float:
+        a, b, c = triangles[tree.query(spot, "intersects")[0]]
+        shares = np.linalg.solve(np.c_[b - a, c - a][:2], np.array([spot.x, spot.y]) - a[:2])
+        return float(a[2] + shares @ np.array([b - a, c - a])[:, 2])
+
+    return height_m
