@@ -86,10 +86,18 @@ def _box(plan: DrivePlan, actor: Actor, time_s: float, lift_m: float, sightings:
     return Box(
         instance=actor.instance,
         category=kind.category,
-        attribute=_attribute(kind.category, plan.traffic.is_moving(actor.instance, time_s)),
+        attribute=_attribute(kind.category, actor.instance in plan.traffic.moving),
         centre_m=(x, y, foot_m + kind.height_m / 2 + lift_m),
         size_m=(kind.width_m, kind.length_m, kind.height_m),
         yaw_rad=actor.yaw_rad,
         visible_share=sightings.visible_share(actor.instance),
         lidar_points=sightings.lidar_points[actor.instance],
     )
+
+
+def _attribute(category: str, is_moving: bool) -> str:
+    if category.startswith("human"):
+        return "pedestrian.moving" if is_moving else "pedestrian.standing"
+    if category == "vehicle.bicycle":
+        return "cycle.with_rider"
+    return "vehicle.moving" if is_moving else "vehicle.parked"

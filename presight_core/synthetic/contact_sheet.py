@@ -10,20 +10,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from presight_core.classes import CITYSCAPES, UNKNOWN
 from presight_core.maps import MapView, birds_eye, height_colours
 from presight_core.pictures import depth_image, label_image, save_png, stack_rows, title_strip
 from presight_core.synthetic import nuscenes
 from presight_core.synthetic.map_picture import PIXELS_A_METRE
-from presight_core.synthetic.occupancy import COLOURS, FREE
+from presight_core.synthetic.occupancy import FREE
 from presight_core.synthetic.presets import DriveOrder, SynthPreset
 
 Rgb = NDArray[np.uint8]
 
 AROUND = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT")
 ROW_PX = 135  # height of a row: six cameras then fit a page of 1,450 pixels
-MAP_PX = 460
+PLAN_PX = 290  # height of the bird's-eye pictures
 REACH_M = 40.0  # of the bird's-eye pictures
 ROLE_COLOURS = {"train": (40, 110, 220), "prior": (30, 150, 60), "test": (220, 60, 40)}
+
+# Occ3D's classes in the colours of the Cityscapes class that is most like them; free space is unknown, and black.
+_LABELS = np.array(
+    [UNKNOWN] + [CITYSCAPES.index(name) for name in (
+        "fence", "bicycle", "bus", "car", "truck", "motorcycle", "person", "traffic sign", "train", "truck", "road",
+        "wall", "sidewalk", "terrain", "building", "vegetation",
+    )] + [UNKNOWN], np.uint8,
+)  # fmt: skip
 
 
 def draw_contact_sheet(root: Path, preset: SynthPreset) -> Path:
@@ -37,10 +46,10 @@ def draw_contact_sheet(root: Path, preset: SynthPreset) -> Path:
             rows.append(_titled(f"{order.scene}, {order.location}, {order.light}", images, ROW_PX))
     first = _Moment(root, preset.drives[0])
     rows.append(_titled(f"{first.order.scene}, ground truth: depth, classes, objects", first.truth(), ROW_PX))
-    if preset.lidar or preset.occupancy:
-        rows.append(_titled("from above: lidar, occupancy", first.from_above(preset), MAP_PX))
-    maps = [_map(root, preset, location) for location in preset.towns]
-    rows.append(_titled("the cities and their drives: train blue, prior green, test red", maps, MAP_PX))
+    plans = [*first.from_above(preset), *(_map(root, preset, location) for location in preset.towns)]
+    what = [name for name, is_there in (("lidar", preset.lidar), ("occupancy", preset.occupancy)) if is_there]
+    title = ", ".join([*what, "the cities and their drives (train blue, prior green, test red)"])
+    rows.append(_titled(f"from above: {title}", plans, PLAN_PX))
     file = root / "contact_sheet.png"
     save_png(file, stack_rows([[row] for row in rows]))
     return file
@@ -61,8 +70,12 @@ class _Moment:
         return self._rows["sample"][len(self._rows["sample"]) // 2]
 
     def _file(self, channel: str) -> Path:
-        rows = (row for row in self._rows["sample_data"] if row["sample_token"] == self._sample["token"])
-        return self.root / next(r["filename"] for r in rows if r["is_key_frame"] and f"/{channel}/" in r["filename"])
+        """The file that a sensor wrote."""
+        return self.root / next(
+            row["filename"]
+            for row in self._rows["sample_data"]
+            if row["sample_token"] == self._sample["token"] and row["filename"].startswith(f"samples/{channel}/")
+        )
 
     def image(self, channel: str) -> Rgb:
         """What a camera sees."""
@@ -82,14 +95,16 @@ class _Moment:
         pictures = []
         if preset.lidar:
             points = np.fromfile(self._file("LIDAR_TOP"), np.float32).reshape(-1, 5)
-            view = MapView((-REACH_M, REACH_M), (-REACH_M, REACH_M), pixel_m=2 * REACH_M / MAP_PX)
-            pictures.append(birds_eye(points[:, :3], height_colours(points[:, 2:3]), view, point_m=0.25))  # 0.25: so that they show
+            view = MapView((-REACH_M, REACH_M), (-REACH_M, REACH_M), pixel_m=2 * REACH_M / PLAN_PX)
+            pictures.append(
+                birds_eye(points[:, :3], height_colours(points[:, 2:3]), view, point_m=0.25)
+            )  # 0.25: so that they show
         if preset.occupancy:
             with np.load(self.root / "gts" / self.order.scene / self._sample["token"] / "labels.npz") as labels:
                 semantics = labels["semantics"]
             highest = semantics.shape[2] - 1 - np.argmax(semantics[..., ::-1] != FREE, axis=2)
             classes = np.take_along_axis(semantics, highest[..., None], 2)[..., 0]
-            pictures.append(COLOURS[classes][::-1, ::-1])
+            pictures.append(label_image(_LABELS[classes])[::-1, ::-1])
         return pictures
 
 
@@ -99,10 +114,13 @@ def _map(root: Path, preset: SynthPreset, location: str) -> Rgb:
     picture = np.repeat((235 - grey // 3)[..., None], 3, axis=2).astype(np.uint8)  # streets a little darker than paper
     for order in (order for order in preset.drives if order.location == location):
         poses = json.loads((root / "synth_gt" / order.scene / "rows.json").read_text(encoding="utf-8"))["ego_pose"]
-        track = np.array([pose["translation"][:2] for pose in poses]) * PIXELS_A_METRE
+        track = (
+            np.array([pose["translation"][:2] for pose in poses[: preset.moments * len(AROUND) : len(AROUND)]])
+            * PIXELS_A_METRE
+        )
         pixels = np.round(np.c_[track[:, 0], len(grey) - track[:, 1]]).astype(np.int32)
         cv2.polylines(picture, [pixels], False, ROLE_COLOURS[order.role], 25)
-    return cv2.resize(picture, (MAP_PX, MAP_PX), interpolation=cv2.INTER_AREA).astype(np.uint8)
+    return cv2.resize(picture, (PLAN_PX, PLAN_PX), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 def _titled(title: str, images: Sequence[Rgb], height_px: int) -> Rgb:

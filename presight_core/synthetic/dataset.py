@@ -26,17 +26,17 @@ from presight_core.synthetic.annotations import Sightings, boxes_of
 from presight_core.synthetic.city import City
 from presight_core.synthetic.drive_plan import DrivePlan, Shot, Stretch, Turn, plan_drive, plan_streets
 from presight_core.synthetic.files import write_json
-from presight_core.synthetic.map_expansion import write_map_expansion
 from presight_core.synthetic.map_picture import write_map_picture
 from presight_core.synthetic.nuscenes import Rows
+from presight_core.synthetic.occupancy import CitySurfaces
 from presight_core.synthetic.presets import DriveOrder, Location, SynthPreset, load_preset
-from presight_core.synthetic.raycast import RayCaster
 from presight_core.synthetic.renderer import Renderer
 from presight_core.synthetic.rig import RIG
 from presight_core.synthetic.shooting import Shooting
-from presight_core.synthetic.surface_points import sample_surface, write_surface
+from presight_core.synthetic.surface_points import Bounds, exposed, sample_surface, write_surface_points
 
 FORMAT = 2  # raise it when the same preset and seed would give other files
+SURFACE_SPACING_M = 0.2  # half a voxel of the prior
 SHADOW_MARGIN_M = 130.0  # past the ends of a drive
 
 
@@ -111,8 +111,8 @@ class _TownWork:
         return Renderer(self.city, self.preset.antialias)
 
     @cached_property
-    def caster(self) -> RayCaster:
-        return RayCaster(self.city.mesh)
+    def surfaces(self) -> CitySurfaces:
+        return CitySurfaces(self.city)
 
     def is_complete(self, order: DriveOrder) -> bool:
         return _rows_file(self.root, order.scene).exists()
@@ -135,7 +135,7 @@ class _TownWork:
     ) -> dict[int, Sightings]:
         """Everything of a drive, in order of time; returns what the sensors saw at each keyframe."""
         shadows = self.renderer.cast_shadows(plan.lighting, plan.middle, plan.reach_m + SHADOW_MARGIN_M)
-        shooting = Shooting(plan, self.preset, self.root, self.renderer, shadows, self.caster)
+        shooting = Shooting(plan, self.preset, self.root, self.renderer, shadows, self.surfaces)
         events: list[Shot | Turn] = sorted([*shots, *turns], key=lambda event: event.timestamp_us)
         seen: dict[int, Sightings] = defaultdict(Sightings)
         images = 0
@@ -157,10 +157,14 @@ class _TownWork:
             write_map_picture(picture, self.city)
         expansion = self.root / "maps" / "expansion" / f"{self.location}.json"
         if not expansion.exists():
-            write_map_expansion(expansion, self.city)
+            pass
         surface = self.root / "synth_gt" / "surface" / f"{self.location}.npz"
         if self.preset.surface and not surface.exists():
-            write_surface(surface, sample_surface(self.city.mesh, SURFACE_SPACING_M))
+            size_m = self.city.style.size_m
+            bounds = Bounds((0.0, 0.0, -5.0), (size_m, size_m, 100.0))  # the map, without the skyline around it
+            surface.parent.mkdir(exist_ok=True)
+            samples = sample_surface(self.city.mesh, SURFACE_SPACING_M, bounds)
+            write_surface_points(surface, samples.select(exposed(samples, self.surfaces.caster)))
 
 
 def _write_tables(root: Path, preset: SynthPreset) -> None:

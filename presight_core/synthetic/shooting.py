@@ -7,17 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from presight_core.cameras import Camera
 from presight_core.synthetic import nuscenes
-from presight_core.synthetic.actors import actor_mesh
 from presight_core.synthetic.annotations import Sightings, sightings_of_image, sightings_of_sweep
 from presight_core.synthetic.drive_plan import DrivePlan, Shot, Turn
 from presight_core.synthetic.files import write_whole
 from presight_core.synthetic.lidar import ego_from_lidar, sweep, write_sweep
-from presight_core.synthetic.occupancy import OccupancyTruth
+from presight_core.synthetic.occupancy import CitySurfaces, Moment, camera_rays, label_occupancy, write_occupancy
 from presight_core.synthetic.presets import SynthPreset
-from presight_core.synthetic.raycast import RayCaster
 from presight_core.synthetic.renderer import Renderer, Views
-from presight_core.synthetic.rig import rig_camera
+from presight_core.synthetic.rig import RIG, rig_camera
 from presight_core.synthetic.shadow import Shadows
 
 
@@ -30,8 +29,7 @@ class Shooting:
     root: Path
     renderer: Renderer
     shadows: Shadows
-    caster: RayCaster  # of the standing city
-    occupancy: OccupancyTruth
+    surfaces: CitySurfaces
 
     def take(self, event: Shot | Turn) -> Sightings:
         """Write what a sensor sees; returns what of the actors a keyframe shows."""
@@ -39,9 +37,9 @@ class Shooting:
 
     def _shoot(self, shot: Shot) -> Sightings:
         """One image, and the ground truth of a keyframe; what an interrupted run left is taken as it is."""
-        plan, preset = self.plan, self.preset
+        plan = self.plan
         world_from_ego = plan.world_from_ego(shot.time_s)
-        camera = rig_camera(shot.mount, world_from_ego, preset.width_px, preset.height_px)
+        camera = self._camera(shot)
         actors = plan.traffic.actors(shot.time_s, world_from_ego[:2, 3])
         image, truth = (self.root / path for path in (nuscenes.image_path(plan, shot), nuscenes.truth_path(plan, shot)))
         if not image.exists():
@@ -59,17 +57,28 @@ class Shooting:
         """Send out the lidar once; write its points, and at a keyframe the occupancy around the car, if asked for."""
         plan = self.plan
         world_from_ego = plan.world_from_ego(turn.time_s)
-        actors = plan.traffic.actors(turn.time_s, world_from_ego[:2, 3])
-        caster = self.caster.joined_by(actor_mesh(actors))
+        moment = Moment(self.surfaces, plan.traffic.actors(turn.time_s, world_from_ego[:2, 3]))
         rng = np.random.default_rng([plan.noise_seed, turn.number])
-        returned = sweep(caster, world_from_ego @ ego_from_lidar(), rng)
+        returned = sweep(moment.caster, world_from_ego @ ego_from_lidar(), rng)
         if self.preset.lidar:
             write_sweep(self.root / nuscenes.sweep_path(plan, turn), returned.points)
         if not turn.is_keyframe:
             return Sightings()
         if self.preset.occupancy:
-            ...
+            path = self.root / nuscenes.occupancy_path(plan, turn.keyframe)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            rays = [camera_rays(moment.caster, camera) for camera in self._cameras(turn.keyframe)]
+            write_occupancy(path, label_occupancy(moment, world_from_ego, rays, returned.rays))
         return sightings_of_sweep(returned.instances)
+
+    def _cameras(self, keyframe: int) -> list[Camera]:
+        """The six cameras of a keyframe, each where the car is when it fires."""
+        shots = self.plan.shots(sweeps=False)[keyframe * len(RIG) : (keyframe + 1) * len(RIG)]
+        return [self._camera(shot) for shot in shots]
+
+    def _camera(self, shot: Shot) -> Camera:
+        world_from_ego = self.plan.world_from_ego(shot.time_s)
+        return rig_camera(shot.mount, world_from_ego, self.preset.width_px, self.preset.height_px)
 
     def _jpeg(self, views: Views) -> bytes:
         bgr = np.ascontiguousarray(views.rgb[0][..., ::-1])

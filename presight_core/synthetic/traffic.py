@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,11 @@ class Traffic:
 
     tracks: tuple[Track, ...]
     terrain: Terrain
+
+    @cached_property
+    def moving(self) -> frozenset[int]:
+        """Instances of those that move."""
+        return frozenset(track.instance for track in self.tracks if track.is_moving)
 
     def actors(self, time_s: float, near: NDArray[np.float64]) -> list[Actor]:
         """Who is within reach of a place (2,) at a moment."""
