@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from presight_core.classes import CITYSCAPES, UNKNOWN
+from presight_core.images import read_rgb
 from presight_core.maps import MapView, birds_eye, height_colours
 from presight_core.pictures import depth_image, label_image, save_png, stack_rows, title_strip
 from presight_core.synthetic import nuscenes
@@ -42,11 +43,11 @@ def draw_contact_sheet(root: Path, preset: SynthPreset) -> Path:
     for order in preset.drives:
         if (order.location, order.light) not in shown:
             shown.add((order.location, order.light))
-            images = [_Moment(root, order).image(channel) for channel in AROUND]
+            images = [_Moment(root, preset, order).image(channel) for channel in AROUND]
             rows.append(_titled(f"{order.scene}, {order.location}, {order.light}", images, ROW_PX))
-    first = _Moment(root, preset.drives[0])
+    first = _Moment(root, preset, preset.drives[0])
     rows.append(_titled(f"{first.order.scene}, ground truth: depth, classes, objects", first.truth(), ROW_PX))
-    plans = [*first.from_above(preset), *(_map(root, preset, location) for location in preset.towns)]
+    plans = [*first.from_above(), *(_map(root, preset, location) for location in preset.towns)]
     what = [name for name, is_there in (("lidar", preset.lidar), ("occupancy", preset.occupancy)) if is_there]
     title = ", ".join([*what, "the cities and their drives (train blue, prior green, test red)"])
     rows.append(_titled(f"from above: {title}", plans, PLAN_PX))
@@ -58,8 +59,8 @@ def draw_contact_sheet(root: Path, preset: SynthPreset) -> Path:
 class _Moment:
     """The keyframe at half time of a drive, read from its files."""
 
-    def __init__(self, root: Path, order: DriveOrder):
-        self.root, self.order = root, order
+    def __init__(self, root: Path, preset: SynthPreset, order: DriveOrder):
+        self.root, self.preset, self.order = root, preset, order
 
     @cached_property
     def _rows(self) -> dict[str, list[dict[str, Any]]]:
@@ -77,9 +78,16 @@ class _Moment:
             if row["sample_token"] == self._sample["token"] and row["filename"].startswith(f"samples/{channel}/")
         )
 
+    def track(self) -> NDArray[np.float64]:
+        """Where the car was (N, 2) when its first camera fired."""
+        poses = {row["token"]: row["translation"][:2] for row in self._rows["ego_pose"]}
+        channel = f"/{AROUND[0]}/"
+        files = [row for row in self._rows["sample_data"] if channel in row["filename"]]
+        return np.array([poses[row["ego_pose_token"]] for row in files])
+
     def image(self, channel: str) -> Rgb:
         """What a camera sees."""
-        return np.asarray(cv2.imread(str(self._file(channel)))[..., ::-1], np.uint8)
+        return read_rgb(self._file(channel), self.preset.width_px, self.preset.height_px)
 
     def truth(self) -> list[Rgb]:
         """Depth, classes and objects of the front cameras, and the image itself."""
@@ -90,16 +98,15 @@ class _Moment:
         objects = np.where(instances[..., None] > 0, colours[instances % 4096], 0).astype(np.uint8)
         return [self.image("CAM_FRONT"), depth_image(depth), label_image(labels), objects]
 
-    def from_above(self, preset: SynthPreset) -> list[Rgb]:
+    def from_above(self) -> list[Rgb]:
         """Lidar points by height and occupied voxels by class, the car's front upwards."""
         pictures = []
-        if preset.lidar:
+        if self.preset.lidar:
             points = np.fromfile(self._file("LIDAR_TOP"), np.float32).reshape(-1, 5)
             view = MapView((-REACH_M, REACH_M), (-REACH_M, REACH_M), pixel_m=2 * REACH_M / PLAN_PX)
-            pictures.append(
-                birds_eye(points[:, :3], height_colours(points[:, 2:3]), view, point_m=0.25)
-            )  # 0.25: so that they show
-        if preset.occupancy:
+            point_m = 0.25  # so that they show
+            pictures.append(birds_eye(points[:, :3], height_colours(points[:, 2:3]), view, point_m))
+        if self.preset.occupancy:
             with np.load(self.root / "gts" / self.order.scene / self._sample["token"] / "labels.npz") as labels:
                 semantics = labels["semantics"]
             highest = semantics.shape[2] - 1 - np.argmax(semantics[..., ::-1] != FREE, axis=2)
@@ -113,11 +120,7 @@ def _map(root: Path, preset: SynthPreset, location: str) -> Rgb:
     grey = np.asarray(cv2.imread(str(root / nuscenes.map_path(location)), cv2.IMREAD_GRAYSCALE))
     picture = np.repeat((235 - grey // 3)[..., None], 3, axis=2).astype(np.uint8)  # streets a little darker than paper
     for order in (order for order in preset.drives if order.location == location):
-        poses = json.loads((root / "synth_gt" / order.scene / "rows.json").read_text(encoding="utf-8"))["ego_pose"]
-        track = (
-            np.array([pose["translation"][:2] for pose in poses[: preset.moments * len(AROUND) : len(AROUND)]])
-            * PIXELS_A_METRE
-        )
+        track = _Moment(root, preset, order).track() * PIXELS_A_METRE
         pixels = np.round(np.c_[track[:, 0], len(grey) - track[:, 1]]).astype(np.int32)
         cv2.polylines(picture, [pixels], False, ROLE_COLOURS[order.role], 25)
     return cv2.resize(picture, (PLAN_PX, PLAN_PX), interpolation=cv2.INTER_AREA).astype(np.uint8)

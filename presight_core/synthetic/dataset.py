@@ -6,6 +6,7 @@ root/gts/<scene>/<sample token>/labels.npz              occupancy, laid out as O
 root/synth_gt/<scene>/<timestamp>_<camera>.npz          depth, labels, instances of each keyframe image
 root/synth_gt/<scene>/rows.json                         that drive's table rows: written last, so it is complete
 root/synth_gt/surface/<location>.npz                    a dense point set of the standing city
+root/contact_sheet.png                                  one look at all of it
 root/synth_gt/synth.json                                what the data set was made from
 """
 
@@ -24,6 +25,7 @@ from presight_core.progress import Progress, Report, silent
 from presight_core.synthetic import nuscenes
 from presight_core.synthetic.annotations import Sightings, boxes_of
 from presight_core.synthetic.city import City
+from presight_core.synthetic.contact_sheet import draw_contact_sheet
 from presight_core.synthetic.drive_plan import DrivePlan, Shot, Stretch, Turn, plan_drive, plan_streets
 from presight_core.synthetic.files import write_json
 from presight_core.synthetic.map_picture import write_map_picture
@@ -65,6 +67,7 @@ def write_dataset(
             tell(0)
         town.write_maps()
     _write_tables(root, preset)
+    draw_contact_sheet(root, preset)
 
 
 def _claim(root: Path, preset: SynthPreset, seed: int) -> None:

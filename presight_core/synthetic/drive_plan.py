@@ -93,7 +93,7 @@ class DrivePlan:
         return self.terrain.stand(*self.pose(time_s).tolist())
 
     def recorded_pose(self, time_s: float) -> NDArray[np.float64]:
-        """The ego pose (4, 4) that the tables give: as in nuScenes true but for the height, which is 0 on any ground."""
+        """The ego pose (4, 4) of the tables: as in nuScenes true but for the height, which is 0 on any ground."""
         pose = self.world_from_ego(time_s)
         if not self.true_height:
             pose[2, 3] = 0.0

@@ -29,6 +29,11 @@ class Town(Settings):
     prior: tuple[Light, ...] = ()
     test: tuple[Light, ...] = ()
 
+    @property
+    def lights(self) -> dict[Role, tuple[Light, ...]]:
+        """The light of each drive, by what the drives are for."""
+        return {"train": self.train, "prior": self.prior, "test": self.test}
+
 
 class SynthPreset(Settings):
     """One data set. Images are best 16:9: 400x225, 800x450 or 1600x900."""
@@ -51,7 +56,7 @@ class SynthPreset(Settings):
     @model_validator(mode="after")
     def _enough_scene_names(self) -> "SynthPreset":
         for role, names in _scene_names(self.paper_split).items():
-            drives = sum(len(getattr(town, role)) for town in self.towns.values())
+            drives = sum(len(town.lights[role]) for town in self.towns.values())
             if drives > len(names):
                 raise ValueError(f"{drives} {role} drives, but only {len(names)} scene names; take fewer drives")
         return self
@@ -96,7 +101,7 @@ def _orders(preset: SynthPreset) -> Iterator[DriveOrder]:
     made = dict.fromkeys(names, 0)
     number = 0
     for location, town in preset.towns.items():
-        for role, lights in (("train", town.train), ("prior", town.prior), ("test", town.test)):
+        for role, lights in town.lights.items():
             streets = town.streets + (town.new_streets if role == "test" else 0)
             for index, light in enumerate(lights):
                 scene = names[role][made[role] if preset.paper_split else number]
