@@ -16,7 +16,7 @@ from presight_core.classes import CITYSCAPES
 from presight_core.frames import invert
 from presight_core.synthetic.actors import KINDS, Actor, actor_mesh
 from presight_core.synthetic.city import City
-from presight_core.synthetic.jit import kernel
+from presight_core.synthetic.jit import inner, kernel
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import Mesh
 from presight_core.synthetic.raycast import RayCaster, Rays
@@ -32,7 +32,9 @@ SHAPE = (200, 200, 16)  # x forward, y left, z up
 LOW_M = (-40.0, -40.0, -1.0)  # ego frame
 VOXEL_M = 0.4
 REACH_M = 57.0  # from the car to a corner of the grid
-SPACING_M = 0.12  # of surface points: eleven on a voxel's face
+FAR_GROUND = (0.015, 0.10)  # below the horizon at depth 1: where cameras see the ground 15 to 90 m away
+FAR_GROUND_ROWS = 56  # 3.5 % apart; a curb ends 5 cm below its voxel's top, 3.7 % of a camera's height above it
+SPACING_M = 0.14  # of surface points: eight on a voxel's face
 ACTOR_SPACING_M = 0.08  # a bicycle's frame is 5 cm wide
 
 _CLASS_OF_LABEL = np.zeros(256, np.uint8)
@@ -71,27 +73,33 @@ class CitySurfaces:
     def __init__(self, city: City):
         self.mesh = city.mesh
         self.caster = RayCaster(city.mesh)
-        self.height_m = city.height_m
+        self._height_m = city.height_m
+        self._size_m = city.style.size_m
+        triangles, starts = city.mesh.vertices[city.mesh.faces], city.mesh.chunks[:, 0]
+        self._low_m = np.minimum.reduceat(triangles.min(1), starts)  # (C, 3) the chunks' bounding boxes
+        self._high_m = np.maximum.reduceat(triangles.max(1), starts)
         self._classes = static_classes(city.mesh)
         self._samples: dict[int, Samples] = {}  # of the chunks that drives came near
 
     def near(self, place: NDArray[np.float64]) -> list[Samples]:
         """Surface samples of every chunk that reaches within REACH_M of a place (2,), world."""
-        spheres = self.mesh.spheres
-        distance_m = np.linalg.norm(spheres[:, :2] - place, axis=1) - spheres[:, 3]
+        beyond_m = np.maximum(self._low_m[:, :2] - place, place - self._high_m[:, :2])
+        distance_m = np.linalg.norm(np.maximum(beyond_m, 0), axis=1)
         return [self._chunk(int(chunk)) for chunk in np.flatnonzero(distance_m < REACH_M)]
 
     def _chunk(self, chunk: int) -> Samples:
         if chunk not in self._samples:
-            x, y, *_ = self.mesh.spheres[chunk].tolist()
-            ground_m = self.height_m(x, y)
-            # The grid reaches from -1 to 5.4 m; 4 m more for slopes. No horizontal limits but the map's far plain.
-            bounds = Bounds((x - 100, y - 100, ground_m - 5), (x + 100, y + 100, ground_m + 9.4))
             faces = np.arange(*self.mesh.chunks[chunk].tolist())
-            sampled = sample_surface(self.mesh, SPACING_M, bounds, faces)
+            sampled = sample_surface(self.mesh, SPACING_M, self._bounds(chunk), faces)
             sampled = sampled.select(exposed(sampled, self.caster))
             self._samples[chunk] = Samples(sampled.points, self._classes[sampled.faces])
         return self._samples[chunk]
+
+    def _bounds(self, chunk: int) -> Bounds:
+        """What of a chunk a grid can reach: the map and a margin, from -1 to 5.4 m above the road, 4 m for slopes."""
+        x, y = ((self._low_m + self._high_m) / 2)[chunk, :2].tolist()
+        ground_m, far_m = self._height_m(x, y), self._size_m + REACH_M
+        return Bounds((-REACH_M, -REACH_M, ground_m - 5), (far_m, far_m, ground_m + 9.4))
 
 
 class Moment:
@@ -124,18 +132,21 @@ def label_occupancy(
 
 
 def camera_rays(caster: RayCaster, camera: Camera) -> Rays:
-    """What a camera sees, with rays so dense that none of the grid's voxels in view slips between them.
+    """What a level camera sees, with rays so dense that none of the grid's voxels in view slips between them.
 
     A voxel holds a ball of its own width. Rays closer than that width over the root of two, at the grid's far
-    corner, always meet it.
+    corner, always meet it. The ground fills most of its voxels, so rows lie closer where it is seen from afar.
     """
-    fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
+    right, down, forward = camera.world_from_camera[:3, :3].T
+    (fx, fy), (cx, cy) = np.diag(camera.intrinsics)[:2], camera.intrinsics[:2, 2]
     spacing = VOXEL_M / np.sqrt(2) / REACH_M  # at depth 1
-    columns, rows = int(np.ceil(camera.width_px / (spacing * fx))), int(np.ceil(camera.height_px / (spacing * fy)))
-    x = (np.arange(columns) + 0.5) * camera.width_px / columns
-    y = (np.arange(rows) + 0.5) * camera.height_px / rows
-    origin, directions = camera.rays(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
-    return caster.look(origin, directions)
+    x = np.arange(-cx / fx, (camera.width_px - cx) / fx, spacing)
+    y = np.arange(-cy / fy, (camera.height_px - cy) / fy, spacing)
+    horizon = -forward[2] / down[2]
+    y = np.r_[y, horizon + np.geomspace(*FAR_GROUND, FAR_GROUND_ROWS)]
+    directions = forward + y[:, None, None] * down + x[:, None] * right
+    directions = directions.reshape(-1, 3) / np.linalg.norm(directions, axis=-1).reshape(-1, 1)
+    return caster.look(camera.world_from_camera[:3, 3], directions)
 
 
 def write_occupancy(path: Path, occupancy: Occupancy) -> None:
@@ -211,8 +222,7 @@ def _mark_seen(origin, directions, reach_m, voxel_from_world, seen):
     """Mark every voxel that a ray passes, and the one that it ends in."""
     m = voxel_from_world
     start, along = np.empty(3), np.empty(3)
-    cell, step = np.empty(3, np.int64), np.empty(3, np.int64)
-    following, stride = np.empty(3), np.empty(3)
+    cell, following = np.empty(3, np.int64), np.empty(3)
     for axis in range(3):
         start[axis] = m[axis, 0] * origin[0] + m[axis, 1] * origin[1] + m[axis, 2] * origin[2] + m[axis, 3]
     for n in range(len(directions)):
@@ -227,16 +237,28 @@ def _mark_seen(origin, directions, reach_m, voxel_from_world, seen):
         for axis in range(3):
             place = int(np.floor(start[axis] + along[axis] * enter))
             cell[axis] = min(max(place, 0), seen.shape[axis] - 1)
-            step[axis] = 1 if along[axis] > 0 else -1
-            stride[axis] = abs(1 / along[axis])
             following[axis] = (cell[axis] + (along[axis] > 0) - start[axis]) / along[axis]
-        while True:
-            seen[cell[0], cell[1], cell[2]] = 1
-            axis = 0 if following[0] < following[1] else 1
-            axis = 2 if following[2] < following[axis] else axis
-            if following[axis] >= leave:
-                break
-            following[axis] += stride[axis]
-            cell[axis] += step[axis]
-            if cell[axis] < 0 or cell[axis] >= seen.shape[axis]:
-                break
+        _walk(cell, along, following, leave, seen)
+
+
+@inner
+def _walk(cell, along, following, leave, seen):
+    """Mark voxels from `cell` on, until `leave`; `following` is where the next wall along each axis is met."""
+    width, depth, height = seen.shape
+    x, y, z = cell[0], cell[1], cell[2]
+    next_x, next_y, next_z = following[0], following[1], following[2]
+    stride_x, stride_y, stride_z = abs(1 / along[0]), abs(1 / along[1]), abs(1 / along[2])
+    step_x, step_y, step_z = 1 if along[0] > 0 else -1, 1 if along[1] > 0 else -1, 1 if along[2] > 0 else -1
+    while 0 <= x < width and 0 <= y < depth and 0 <= z < height:
+        seen[x, y, z] = 1
+        if min(next_x, next_y, next_z) >= leave:
+            return
+        if next_x <= next_y and next_x <= next_z:
+            next_x += stride_x
+            x += step_x
+        elif next_y <= next_z:
+            next_y += stride_y
+            y += step_y
+        else:
+            next_z += stride_z
+            z += step_z

@@ -7,13 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from presight_core.classes import CITYSCAPES
+from presight_core.synthetic.jit import kernel
 from presight_core.synthetic.mesh import Mesh
 from presight_core.synthetic.raycast import RayCaster
 
 GROUND_LABELS = [CITYSCAPES.index(name) for name in ("road", "sidewalk", "terrain")]
 BUILDING = CITYSCAPES.index("building")
 LIFT_M = 0.002  # rays leave a surface from this far above it
+EYE_M = 0.3  # over grass edges and thresholds, below windowsills
 BURIED_M = 0.5  # the ground's own layers lie closer together than this
+CUT_M = 10.0  # triangles wider than this are split before they are clipped
 GOLDEN = (0.7548776662466927, 0.5698402909980532)  # 1 / p and 1 / p**2 with p**3 = p + 1: Roberts' R2 sequence
 
 
@@ -44,18 +47,17 @@ def sample_surface(
     Faces are laid end to end by area and cut into equal steps, so that many small faces get as much as a large one
     of their total area. Only points inside `bounds` come back.
     """
-    chosen = np.arange(len(mesh.faces)) if faces is None else np.asarray(faces)
-    chosen = chosen if bounds is None else chosen[_touches(mesh.vertices[mesh.faces[chosen]], bounds)]
-    corner, second, third = (mesh.vertices[mesh.faces[chosen, k]].astype(np.float64) for k in range(3))
-    along, across = second - corner, third - corner
-    ends_m2 = np.cumsum(np.linalg.norm(np.cross(along, across), axis=1) / 2)
+    chosen = np.arange(len(mesh.faces), dtype=np.int32) if faces is None else np.asarray(faces, np.int32)
+    triangles = mesh.vertices[mesh.faces[chosen]]
+    if bounds is not None:
+        triangles, chosen = _clip_roughly(triangles, chosen, bounds)
+    sides = triangles[:, 1:] - triangles[:, :1]
+    ends_m2 = np.cumsum(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2, dtype=np.float64)
     count = int(ends_m2[-1] / spacing_m**2) if len(chosen) else 0
-    places = np.arange(count) + 0.5
-    rows = np.searchsorted(ends_m2, places * spacing_m**2)
-    u, v = (places[:, None] * GOLDEN % 1.0).T
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)  # the far half of the square folds back
-    points = (corner[rows] + u[:, None] * along[rows] + v[:, None] * across[rows]).astype(np.float32)
-    sampled = SurfacePoints(points, mesh.labels[chosen[rows]], chosen[rows].astype(np.int32))
+    points, rows = np.empty((count, 3), np.float32), np.empty(count, np.int32)
+    _spread(triangles, ends_m2 / spacing_m**2, points, rows)
+    faces = chosen[rows]
+    sampled = SurfacePoints(points, mesh.labels[faces], faces)
     return sampled if bounds is None else sampled.select(_inside(points, bounds))
 
 
@@ -65,13 +67,14 @@ def exposed(samples: SurfacePoints, caster: RayCaster) -> NDArray[np.bool_]:
     Ground under ground sees the back of a ground face when it looks up; ground in a building sees the back of a
     wall when it looks sideways. Everything else that is hidden is left in: it is little, and true.
     """
-    is_open = np.ones(len(samples.points), np.bool_)
+    up, sideways = np.array([0, 0, 1], np.float32), np.array([1, 0, 0], np.float32)
     ground = np.flatnonzero(np.isin(samples.labels, GROUND_LABELS))
-    start = samples.points[ground] + np.array([0, 0, LIFT_M], np.float32)
-    above = _sees_back(caster, start, np.array([0.0, 0.0, 1.0]), GROUND_LABELS, BURIED_M)
-    eye = start + np.array([0, 0, 0.3], np.float32)  # 0.3: over grass edges and thresholds, below windowsills
-    beside = _sees_back(caster, eye, np.array([1.0, 0.0, 0.0]), [BUILDING], np.inf)
-    is_open[ground] = ~(above | beside)
+    is_buried = _sees_back(caster, samples.points[ground] + LIFT_M * up, up, GROUND_LABELS, BURIED_M)
+    is_open = np.ones(len(samples.points), np.bool_)
+    is_open[ground[is_buried]] = False
+    ground = ground[~is_buried]
+    is_indoors = _sees_back(caster, samples.points[ground] + EYE_M * up, sideways, [BUILDING], np.inf)
+    is_open[ground[is_indoors]] = False
     return is_open
 
 
@@ -84,6 +87,24 @@ def read_surface_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uin
     """Points (N, 3) and labels (N,) of a file that `write_surface_points` wrote."""
     with np.load(path) as file:
         return file["points"], file["labels"]
+
+
+@kernel
+def _spread(triangles, ends, points, rows):
+    """Place a point at every half number on a scale where triangle k ends at `ends[k]`."""
+    row = 0
+    for n in range(len(points)):
+        place = n + 0.5
+        while ends[row] < place:
+            row += 1
+        u, v = place * GOLDEN[0] % 1.0, place * GOLDEN[1] % 1.0
+        if u + v > 1:  # the far half of the square folds back
+            u, v = 1 - u, 1 - v
+        for axis in range(3):
+            corner = triangles[row, 0, axis]
+            along, across = triangles[row, 1, axis] - corner, triangles[row, 2, axis] - corner
+            points[n, axis] = corner + u * along + v * across
+        rows[n] = row
 
 
 def _sees_back(
@@ -99,6 +120,23 @@ def _inside(points: NDArray[np.float32], bounds: Bounds) -> NDArray[np.bool_]:
     return np.all(
         (points >= np.asarray(bounds.low, np.float32)) & (points < np.asarray(bounds.high, np.float32)), axis=1
     )
+
+
+def _clip_roughly(triangles: NDArray[np.float32], faces: NDArray, bounds: Bounds) -> tuple[NDArray, NDArray]:
+    """Triangles (F, 3, 3) and their faces (F,) without what lies outside; large triangles are split to that end."""
+    kept = _touches(triangles, bounds)
+    triangles, faces = triangles[kept], faces[kept]
+    while True:
+        is_large = np.ptp(triangles, axis=1).max(1) > CUT_M
+        if not is_large.any():
+            return np.ascontiguousarray(triangles), faces
+        a, b, c = triangles[is_large].swapaxes(0, 1)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        parts = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(2, 0, 1, 3)  # (F, 4, 3, 3)
+        parts, part_faces = parts.reshape(-1, 3, 3), np.repeat(faces[is_large], 4)
+        kept = _touches(parts, bounds)
+        triangles = np.concatenate([triangles[~is_large], parts[kept]])
+        faces = np.concatenate([faces[~is_large], part_faces[kept]])
 
 
 def _touches(triangles: NDArray[np.float32], bounds: Bounds) -> NDArray[np.bool_]:
