@@ -11,10 +11,14 @@ import numba
 # fastmath: reassociation changes the last bits only, and the same build gives the same bytes.
 _OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True}
 
-# What Python calls: kept on disk.
-kernel = numba.njit(cache=True, **_OPTIONS)
+# What Python calls: kept on disk. Nobody calls from C, and a wrapper for that would take a tenth of the time to compile.
+kernel = numba.njit(cache=True, no_cfunc_wrapper=True, **_OPTIONS)
 
-# What kernels call: becomes part of them; wrappers for Python and C would double the time to compile.
+# A kernel that allocates nothing: its callers own all arrays, so it need not count references to them, which would
+# take more than half of its time, pixel by pixel.
+shader = numba.njit(cache=True, no_cfunc_wrapper=True, _nrt=False, **_OPTIONS)
+
+# What kernels call: becomes part of them, and needs no wrapper for Python either.
 _BARE: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_OPTIONS}
 inner = numba.njit(**_BARE)
 
@@ -24,7 +28,7 @@ spliced = numba.njit(inline="always", **_OPTIONS)
 
 def typed(signature: str) -> Callable:
     """Like `inner`, compiled once for this signature; otherwise every literal argument makes another copy."""
-    return numba.njit(signature, cache=True, **_OPTIONS)
+    return numba.njit(signature, cache=True, **_BARE)
 
 
 def _drop_stale_kernels() -> None:

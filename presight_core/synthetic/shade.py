@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from presight_core.synthetic.jit import inner, kernel, spliced
+from presight_core.synthetic.jit import inner, shader, spliced
 from presight_core.synthetic.lamps import Lamps, beam_light, street_light
 from presight_core.synthetic.lighting import Lighting
 from presight_core.synthetic.materials import Material
@@ -71,27 +71,39 @@ def sky_colour(dx, dy, dz, light):
 
 
 @spliced
+def face_surface(mesh, face):
+    """Material, normal, colour and wall of a face, as numbers: views of arrays would be counted, pixel by pixel."""
+    n, c, w = mesh.normals, mesh.colours, mesh.walls
+    return (
+        int(mesh.materials[face]),
+        (float(n[face, 0]), float(n[face, 1]), float(n[face, 2])),
+        (float(c[face, 0]), float(c[face, 1]), float(c[face, 2])),
+        (float(w[face, 0]), float(w[face, 1]), float(w[face, 2]), float(w[face, 3]), float(w[face, 4])),
+    )
+
+
+@spliced
 def shade_point(scene, face, ray, depth, focal, position):
     """Radiance towards the camera of a face seen along `ray` (unit depth, world axes) at an optical-axis depth."""
     light = scene.lighting
-    mesh = scene.city
-    if face >= len(scene.city.faces):
-        mesh = scene.actors
-        face = face - len(scene.city.faces)
+    city_faces = len(scene.city.materials)
+    if face < city_faces:
+        material, normal, colour, wall = face_surface(scene.city, face)
+    else:
+        material, normal, colour, wall = face_surface(scene.actors, face - city_faces)
     stretch = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
     dx, dy, dz = ray[0] / stretch, ray[1] / stretch, ray[2] / stretch
     x, y, z = position[0] + ray[0] * depth, position[1] + ray[1] * depth, position[2] + ray[2] * depth
     distance = depth * stretch
-    nx, ny, nz = mesh.normals[face, 0], mesh.normals[face, 1], mesh.normals[face, 2]
+    nx, ny, nz = normal
     facing = nx * dx + ny * dy + nz * dz
     if facing > 0:  # the back of a leaf
         nx, ny, nz, facing = -nx, -ny, -nz, -facing
-    material = mesh.materials[face]
     footprint = distance / focal / max(-facing, 0.08)
     if is_ground(material):
         footprint = 0.5 * distance / focal / max(-facing, 0.02)  # half: between a pixel's short and long axis
     red, green, blue, gloss, glow_r, glow_g, glow_b = surface(
-        material, x, y, z, (nx, ny, nz), mesh.walls[face], mesh.colours[face], footprint, -facing, light
+        material, x, y, z, (nx, ny, nz), wall, colour, footprint, -facing, light
     )
     if material == _FOLIAGE:  # leaves point anywhere
         nx += 1.6 * (value_noise(4 * x + 7, 4 * z, 33) - 0.5)
@@ -119,7 +131,7 @@ def shade_point(scene, face, ray, depth, focal, position):
 @inner
 def surface(material, x, y, z, normal, wall, colour, footprint, facing, light):
     """Reflectance (3), gloss and emitted radiance (3) of a surface point; `facing` is the cosine to the viewer."""
-    red, green, blue = float(colour[0]), float(colour[1]), float(colour[2])
+    red, green, blue = colour
     if material == _FACADE:
         red, green, blue, gloss, lit, warm = facade(
             x, y, z, normal, wall, footprint, (red, green, blue), light.lit_share
@@ -207,7 +219,7 @@ def sample_light(scene, view, face, row, column, nearness, samples_a_pixel):
     return gain * red * light.balance[0], gain * green * light.balance[1], gain * blue * light.balance[2]
 
 
-@kernel
+@shader
 def shade_view(scene: Scene, view: PinholeView, antialias: bool, nearness, faces, exposure):
     """Fill `exposure` (H, W, 3) float32 from sample buffers: (2 H + 1, 2 W + 1), or (H, W) without antialiasing."""
     height, width = exposure.shape[0], exposure.shape[1]
