@@ -64,7 +64,7 @@ class PriorFusion2D(nn.Module):
 
         voxels (V, voxel_channels) of the whole batch; coordinates (V, 4) int64: sample, x, y, z.
         """
-        dense = _dense(self.voxel_feature_extractor(voxels), coordinates, len(bev), self.settings.grid)
+        dense = _dense(self.voxel_feature_extractor(voxels), coordinates, bev.shape[0], self.settings.grid)
         height = dense.shape[3] // SLICE_VOXELS
         slices = dense[:, :, :, : height * SLICE_VOXELS].unflatten(3, (height, SLICE_VOXELS)).amax(4)
         flat = self.block1(slices.permute(0, 4, 3, 1, 2).flatten(1, 2))  # a channel's slices side by side
@@ -97,11 +97,10 @@ class PriorFusion3D(nn.Module):
 
         voxels (V, voxel_channels) of the whole batch; coordinates (V, 4) int64: sample, x, y, z.
         """
-        dense = _dense(self.voxel_feature_extractor(voxels), coordinates, len(bev), self.settings.grid)
+        dense = _dense(self.voxel_feature_extractor(voxels), coordinates, bev.shape[0], self.settings.grid)
         flat = self.block1(dense.permute(0, 4, 3, 1, 2).flatten(1, 2))  # a channel's heights side by side
         flat = functional.max_pool2d(flat, 2)
-        if flat.shape[-2:] != bev.shape[2:4]:
-            flat = functional.interpolate(flat, bev.shape[2:4], mode="bilinear", align_corners=True)
+        flat = functional.interpolate(flat, bev.shape[2:4], mode="bilinear", align_corners=True)  # exact if sizes agree
         prior = flat.unflatten(1, (-1, self.settings.heights)).permute(0, 1, 3, 4, 2)
         fused = self.block2(torch.cat([bev, prior], 1))
         return torch.relu(fused + bev if self.settings.residual else fused)

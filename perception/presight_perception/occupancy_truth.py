@@ -42,7 +42,7 @@ def read_occupancy(folder: Path, scene_name: str, sample_token: str) -> Occupanc
     if not file.is_file():
         raise NotFoundError(f"{file} does not exist; unpack Occ3D's gts there, or check scene and token")
     try:
-        with np.load(file, allow_pickle=False) as opened:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as opened:
             arrays = [opened[name] for name in ("semantics", "mask_camera", "mask_lidar")]
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"{file} is not an Occ3D label file ({error}); download it again") from error
