@@ -8,10 +8,10 @@ BIN = .venv/bin
 
 install: .venv/.installed
 
-.venv/.installed: pyproject.toml constraints-cpu.txt
+.venv/.installed: pyproject.toml perception/pyproject.toml constraints-cpu.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(if $(TORCH),$(BIN)/pip install --quiet --no-compile '$(TORCH)',$(BIN)/python -c 'import torch')
-	$(BIN)/pip install --quiet --no-compile $(if $(TORCH),-c constraints-cpu.txt) -e '.[pipeline,dev]'
+	$(BIN)/pip install --quiet --no-compile $(if $(TORCH),-c constraints-cpu.txt) -e '.[pipeline,dev]' -e perception
 	touch $@
 
 demo: install
@@ -30,4 +30,4 @@ lint: install
 	$(BIN)/lint-imports
 
 clean:
-	rm -rf .venv build dist *.egg-info
+	rm -rf .venv build dist *.egg-info perception/build perception/*.egg-info

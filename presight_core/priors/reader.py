@@ -1,7 +1,7 @@
 """Reads the prior around a vehicle from a store: only the blocks it needs, only numpy, zarr and obstore."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,14 @@ from presight_core.priors.documents import (
     generations_path,
 )
 from presight_core.priors.location import ReadLocation
-from presight_core.priors.schema import CENTROID_STEPS, array_specs, unpack_columns, unpack_voxels
+from presight_core.priors.schema import (
+    CENTROID_STEPS,
+    array_specs,
+    drive_bits,
+    unpack_columns,
+    unpack_voxels,
+    word_count,
+)
 from presight_core.priors.window import Range, Window, WindowBox
 
 VOXEL_ARRAYS = ("voxel", "centroid", "features", "hits", "density", "rgb")
@@ -78,14 +85,18 @@ class PriorReader:
         x_m: Range = (-50.0, 50.0),
         y_m: Range = (-25.0, 25.0),
         z_m: Range = (-3.0, 5.0),
+        without_drives: Collection[str] = (),
     ) -> Window:
         """The prior in the given box of the ego frame, metres; empty outside the city.
 
+        without_drives: voxels that no other drive saw are left out; the others keep what all drives made of them.
         Raises InputError for a pose that is not rigid, StoreError if stored data is lost or damaged.
         """
         box = WindowBox.at(world_from_ego, x_m, y_m, z_m)
         tiles = [tile_id for tile_id in self.tiles if _may_meet(box, self.generation.tiles[tile_id], self.lattice)]
-        parts = {tile_id: part for tile_id in tiles if (part := self.tile(tile_id).read(box)) is not None}
+        parts = {
+            tile_id: part for tile_id in tiles if (part := self.tile(tile_id).read(box, without_drives)) is not None
+        }
         return _window(box, self.lattice, self.channel_count, parts)
 
     def tile(self, tile_id: str) -> "TileTable":
@@ -124,6 +135,7 @@ class TileTable:
     arrays: dict[str, zarr.Array]
     block_index: NDArray[np.int32]  # (B, 2)
     block_start: NDArray[np.int64]  # (B + 1,)
+    drives: tuple[str, ...]  # in bit order
 
     @staticmethod
     def open(store: Store, city: CityDocument, tile: GenerationTile) -> "TileTable":
@@ -141,10 +153,10 @@ class TileTable:
                 raise StoreError(
                     f"{name}/{key}: {arrays[key].dtype}{arrays[key].shape}, expected {spec.dtype}{expected}"
                 )
-        return TileTable(name, city.lattice, arrays, block_index, block_start)
+        return TileTable(name, city.lattice, arrays, block_index, block_start, entry.drives)
 
-    def read(self, box: WindowBox) -> TilePart | None:
-        """The voxels and observed columns in the box; None if no block meets it."""
+    def read(self, box: WindowBox, without_drives: Collection[str] = ()) -> TilePart | None:
+        """The voxels, of those that other drives saw, and observed columns in the box; None if no block meets it."""
         blocks = np.flatnonzero(box.meets(self.block_index, self.lattice))
         if not len(blocks):
             return None
@@ -154,6 +166,8 @@ class TileTable:
         block_of_row = np.repeat(self.block_index[blocks], counts, axis=0)
         points_world = _points(columns["voxel"], columns["centroid"], block_of_row, self.lattice)
         points_ego, inside = box.inside(points_world)
+        if not set(self.drives).isdisjoint(without_drives):
+            inside &= self._seen_by_others(rows, without_drives)
         columns |= {"points_world": points_world, "points_ego": points_ego.astype(np.float32)}
         observed = unpack_columns(self.rows("observed", blocks))
         return TilePart({name: column[inside] for name, column in columns.items()}, self.block_index[blocks], observed)
@@ -167,6 +181,12 @@ class TileTable:
             with _naming(f"{self.name}/{name}"):
                 result[low:high] = np.asarray(array[first : min(last, array.shape[0])])[rows[low:high] - first]
         return result
+
+    def _seen_by_others(self, rows: NDArray[np.int64], without_drives: Collection[str]) -> NDArray[np.bool_]:
+        count = len(self.drives)
+        others = [drive_bits(bit, count) for bit, drive in enumerate(self.drives) if drive not in without_drives]
+        kept = np.bitwise_or.reduce([np.zeros(word_count(count), np.uint32), *others])
+        return (self.rows("drives", rows) & kept).any(-1)
 
     def all_rows(self, name: str) -> NDArray:
         """A whole array."""

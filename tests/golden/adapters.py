@@ -18,6 +18,7 @@ from presight_core.field.hash_encode.layout import level_resolutions
 from presight_core.field.spherical_harmonics import spherical_harmonics
 from stages.tiling import box_of
 from tests.golden.cases import Check, absolute, equal, of_maximum, relative
+from tests.golden.perception_adapters import PERCEPTION_ADAPTERS
 
 Golden = Mapping[str, NDArray]
 PULSE_WIDTHS = (0.03, 0.003)  # of the released code's interlevel loss
@@ -187,6 +188,7 @@ ADAPTERS: dict[str, Callable[[Golden], list[Check]]] = {
     "render_weights": render_weights,
     "losses": losses_case,
     "subfield_aabb": subfield_aabb,
+    **PERCEPTION_ADAPTERS,
 }
 
 

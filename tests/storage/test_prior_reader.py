@@ -57,6 +57,21 @@ def test_window_holds_exactly_the_voxels_in_the_box(town, name: str):
         np.testing.assert_array_equal(getattr(window, column), expected[column])
 
 
+@pytest.mark.parametrize("left_out", [{"drive-1"}, {"drive-0", "drive-2"}, {"drive-0", "drive-1", "drive-2"}])
+def test_a_window_without_drives_holds_the_voxels_that_others_saw(town, left_out):
+    reader = town.reader()
+    kept = sum(1 << bit for bit in range(3) if f"drive-{bit}" not in left_out)
+    seen = np.concatenate([batch.drives[:, 0] & kept > 0 for batch in town.example.batches()])
+    expected = reader.tile("t000").all_rows("hits")[seen]
+    window = reader.window(POSES["level"], (-60.0, 60.0), (-60.0, 60.0), (-90.0, 90.0), without_drives=left_out)
+    np.testing.assert_array_equal(window.hits, expected)
+
+
+def test_leaving_out_an_unknown_drive_changes_nothing(town):
+    whole, same = (town.reader().window(POSES["level"], without_drives=names) for names in ((), ("elsewhere",)))
+    np.testing.assert_array_equal(whole.points_world, same.points_world)
+
+
 def test_observed_columns_are_those_of_the_tile_inside_the_footprint(town):
     pose, lattice = POSES["rotated"], town.example.lattice
     window = town.reader().window(pose, **RANGES)

@@ -1,0 +1,1 @@
+"""PreSight's priors at work in perception models: dataset, voxels, fusion, metrics."""
