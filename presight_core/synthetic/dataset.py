@@ -227,7 +227,6 @@ def _boxes(
         for instance, pair in pixels.items():
             key = shot.moment // SWEEPS_A_KEYFRAME, instance
             sums[key] = sums.get(key, np.zeros(2)) + pair
-    moving = {track.instance: track.is_moving for track in plan.traffic.tracks}
     boxes: dict[int, list[nuscenes.Box]] = {}
     for keyframe in range(plan.keyframes):
         time_s = (plan.keyframe_us(keyframe) - plan.start_us) / 1e6
@@ -236,17 +235,17 @@ def _boxes(
         for actor in plan.traffic.actors(time_s, place):
             if np.hypot(actor.x_m - place[0], actor.y_m - place[1]) < ANNOTATED_M:
                 visible, expected = sums.get((keyframe, actor.instance), np.array([0.0, 1.0]))
-                boxes[keyframe].append(_box(actor, moving[actor.instance], float(min(visible / expected, 1.0))))
+                boxes[keyframe].append(_box(actor, float(min(visible / expected, 1.0))))
     return boxes
 
 
-def _box(actor: Actor, is_moving: bool, visible_share: float) -> nuscenes.Box:
+def _box(actor: Actor, visible_share: float) -> nuscenes.Box:
     kind = KINDS[actor.kind]
     x, y, foot_m = foot_of(actor).tolist()
     return nuscenes.Box(
         instance=actor.instance,
         category=kind.category,
-        attribute=_attribute(kind.category, is_moving),
+        attribute=_attribute(actor),
         centre_m=(x, y, foot_m + kind.height_m / 2),
         size_m=(kind.width_m, kind.length_m, kind.height_m),
         yaw_rad=actor.yaw_rad,
@@ -254,9 +253,13 @@ def _box(actor: Actor, is_moving: bool, visible_share: float) -> nuscenes.Box:
     )
 
 
-def _attribute(category: str, is_moving: bool) -> str:
-    if category.startswith("human"):
-        return "pedestrian.moving" if is_moving else "pedestrian.standing"
-    if category == "vehicle.bicycle":
-        return "cycle.with_rider"
-    return "vehicle.moving" if is_moving else "vehicle.parked"
+def _attribute(actor: Actor) -> str:
+    """The one attribute that nuScenes gives an object; empty for what has none."""
+    kind = KINDS[actor.kind]
+    if kind.category.startswith("movable_object"):
+        return ""
+    if kind.category.startswith("human"):
+        return "pedestrian.moving" if actor.motion == "moving" else "pedestrian.standing"
+    if kind.category in ("vehicle.bicycle", "vehicle.motorcycle"):
+        return "cycle.with_rider" if kind.has_rider else "cycle.without_rider"
+    return f"vehicle.{actor.motion}"
