@@ -86,7 +86,7 @@ def _box(plan: DrivePlan, actor: Actor, time_s: float, lift_m: float, sightings:
     return Box(
         instance=actor.instance,
         category=kind.category,
-        attribute=_attribute(kind.category, actor.instance in plan.traffic.moving),
+        attribute=_attribute(actor),
         centre_m=(x, y, foot_m + kind.height_m / 2 + lift_m),
         size_m=(kind.width_m, kind.length_m, kind.height_m),
         yaw_rad=actor.yaw_rad,
@@ -95,9 +95,13 @@ def _box(plan: DrivePlan, actor: Actor, time_s: float, lift_m: float, sightings:
     )
 
 
-def _attribute(category: str, is_moving: bool) -> str:
-    if category.startswith("human"):
-        return "pedestrian.moving" if is_moving else "pedestrian.standing"
-    if category == "vehicle.bicycle":
-        return "cycle.with_rider"
-    return "vehicle.moving" if is_moving else "vehicle.parked"
+def _attribute(actor: Actor) -> str:
+    """The one attribute that nuScenes gives an object; empty for what has none."""
+    kind = KINDS[actor.kind]
+    if kind.category.startswith("movable_object"):
+        return ""
+    if kind.category.startswith("human"):
+        return "pedestrian.moving" if actor.motion == "moving" else "pedestrian.standing"
+    if kind.category in ("vehicle.bicycle", "vehicle.motorcycle"):
+        return "cycle.with_rider" if kind.has_rider else "cycle.without_rider"
+    return f"vehicle.{actor.motion}"

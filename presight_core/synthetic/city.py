@@ -38,6 +38,7 @@ class City:
         style = self.style
         self.graph = StreetGraph(rng, style)
         self.layers = lay_streets(self.graph, style)
+        shapely.prepare(self.layers.road)
         self.terrain = Terrain(seed, style.relief_m)
         site = Site(MeshBuilder(), rng, style, self.terrain)
         _lay_surfaces(site, self.layers)
@@ -52,6 +53,11 @@ class City:
     def height_m(self, x_m: float, y_m: float) -> float:
         """Height of the road surface at a place."""
         return float(self.terrain.height_m(x_m, y_m))
+
+    def surface_m(self, x_m: float, y_m: float) -> float:
+        """Height of what one stands on at a place: the road, or a curb higher, all else."""
+        is_road = bool(shapely.contains_xy(self.layers.road, x_m, y_m))
+        return self.height_m(x_m, y_m) + (0.0 if is_road else CURB_M)
 
 
 def _lay_surfaces(site: Site, layers: StreetLayers) -> None:

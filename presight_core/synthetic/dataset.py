@@ -28,7 +28,8 @@ from presight_core.synthetic.city import City
 from presight_core.synthetic.contact_sheet import draw_contact_sheet
 from presight_core.synthetic.drive_plan import DrivePlan, Shot, Stretch, Turn, plan_drive, plan_streets
 from presight_core.synthetic.files import write_json
-from presight_core.synthetic.map_picture import write_map_picture
+from presight_core.synthetic.map_expansion import write_map_expansion
+from presight_core.synthetic.map_picture import write_base_map, write_map_picture
 from presight_core.synthetic.nuscenes import Rows
 from presight_core.synthetic.occupancy import CitySurfaces
 from presight_core.synthetic.presets import DriveOrder, Location, SynthPreset, load_preset
@@ -154,20 +155,25 @@ class _TownWork:
         return seen
 
     def write_maps(self) -> None:
-        """The city's map as picture and vectors, and its surface, where they are missing."""
-        picture = self.root / nuscenes.map_path(self.location)
-        if not picture.exists():
-            write_map_picture(picture, self.city)
-        expansion = self.root / "maps" / "expansion" / f"{self.location}.json"
-        if not expansion.exists():
-            pass
+        """The city's map as pictures and vectors, and its surface, where they are missing."""
+        maps = self.root / "maps"
+        for file, write in (
+            (self.root / nuscenes.map_path(self.location), write_map_picture),
+            (maps / "basemap" / f"{self.location}.png", write_base_map),
+            (maps / "expansion" / f"{self.location}.json", write_map_expansion),
+        ):
+            if not file.exists():
+                write(file, self.city)
         surface = self.root / "synth_gt" / "surface" / f"{self.location}.npz"
         if self.preset.surface and not surface.exists():
-            size_m = self.city.style.size_m
-            bounds = Bounds((0.0, 0.0, -5.0), (size_m, size_m, 100.0))  # the map, without the skyline around it
-            surface.parent.mkdir(exist_ok=True)
-            samples = sample_surface(self.city.mesh, SURFACE_SPACING_M, bounds)
-            write_surface_points(surface, samples.select(exposed(samples, self.surfaces.caster)))
+            self._write_surface(surface)
+
+    def _write_surface(self, file: Path) -> None:
+        size_m = self.city.style.size_m
+        bounds = Bounds((0.0, 0.0, -5.0), (size_m, size_m, 100.0))  # the map, without the skyline around it
+        samples = sample_surface(self.city.mesh, SURFACE_SPACING_M, bounds)
+        file.parent.mkdir(exist_ok=True)
+        write_surface_points(file, samples.select(exposed(samples, self.surfaces.caster)))
 
 
 def _write_tables(root: Path, preset: SynthPreset) -> None:

@@ -274,7 +274,7 @@ def _annotation_row(plan: DrivePlan, keyframe: int, box: Box, chain: Sequence[st
         "sample_token": sample_token(plan, keyframe),
         "instance_token": token(plan.name, "instance", box.instance),
         "visibility_token": str(level + 1),
-        "attribute_tokens": [token("attribute", box.attribute)],
+        "attribute_tokens": [token("attribute", box.attribute)] if box.attribute else [],
         "translation": list(box.centre_m),
         "size": list(box.size_m),
         "rotation": [float(np.cos(box.yaw_rad / 2)), 0.0, 0.0, float(np.sin(box.yaw_rad / 2))],

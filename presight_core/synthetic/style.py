@@ -57,9 +57,14 @@ class CityStyle:
 
 @dataclass(frozen=True)
 class Density:
-    """How busy the streets are."""
+    """How busy the streets are; counts are upper bounds, for who finds no room stays at home."""
 
     vehicles: int = 26  # driving
-    cyclists: int = 5
-    pedestrians: int = 34
+    cyclists: int = 9
+    motorcyclists: int = 3
+    pedestrians: int = 34  # on sidewalks
+    crossing: int = 7  # pedestrians on crossings
     parked: float = 0.42  # share of bays taken
+    bicycles: int = 7  # left on sidewalks
+    roadworks: int = 2
+    stopping: float = 0.45  # share of those on wheels that stop at a stop line once

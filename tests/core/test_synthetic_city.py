@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
+from numpy.typing import NDArray
 from shapely import LineString, Point, Polygon, STRtree
 from shapely.ops import unary_union
 
@@ -18,7 +20,7 @@ from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import Mesh
 from presight_core.synthetic.street import RADIUS_M
 from presight_core.synthetic.style import CityStyle
-from presight_core.synthetic.traffic import plan_traffic
+from presight_core.synthetic.traffic import Traffic, plan_traffic
 
 SMALL = CityStyle(size_m=200.0, spacing_m=90.0)
 
@@ -94,19 +96,6 @@ def test_lanes_crossings_and_stop_lines_lie_on_the_road():
     assert all(road.contains(lane.polygon) for lane in layers.lanes)
 
 
-def test_nobody_drives_into_the_ego_vehicle(city: City):
-    rng = np.random.default_rng(3)
-    route = city.graph.route(city.graph.random_path(rng, 0, 4))
-    times = np.linspace(0, 6, 61)
-    ego = follow(route, 5 + 6 * times)
-    traffic = plan_traffic(city, rng, ego, duration_s=6.0)
-    driving = [track for track in traffic.tracks if track.is_moving and track.kind != "pedestrian"]
-    assert driving
-    for track in driving:
-        gaps = np.linalg.norm(track.poses(times)[:, :2] - ego[:, :2], axis=1)
-        assert gaps.min() > 1.9, track.kind  # half a car and half a lane
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_actors_fill_the_box_that_annotations_give_them(kind: str):
     mesh = actor_mesh([Actor(kind, 0.0, 0.0, 0.0, (0.5, 0.5, 0.5), 1_000_000)])
@@ -115,9 +104,11 @@ def test_actors_fill_the_box_that_annotations_give_them(kind: str):
     np.testing.assert_allclose(size, box, rtol=0.15)
 
 
-def test_vehicles_stand_on_the_road_and_pedestrians_on_the_sidewalk():
-    feet_m = [foot_of(Actor(kind, 50, 60, 0, (0.5, 0.5, 0.5), 1_000_000, 7.0))[2] for kind in ("car", "pedestrian")]
-    np.testing.assert_allclose(feet_m, [7.02, 7.16])
+def test_the_surface_is_the_road_or_a_curb_higher(city: City):
+    on_road = city.graph.street(*city.graph.edges[0]).at(30.0)
+    assert city.surface_m(*on_road) == city.height_m(*on_road)
+    x, y = city.layers.walkway[0].representative_point().coords[0]
+    assert city.surface_m(x, y) == pytest.approx(city.height_m(x, y) + 0.15)
 
 
 def test_cyclists_carry_two_labels():
@@ -244,3 +235,81 @@ def _heights_under(mesh: Mesh, materials: tuple[Material, ...]) -> Callable[[Poi
         return float(a[2] + shares @ np.array([b - a, c - a])[:, 2])
 
     return height_m
+
+
+# ---- traffic -----------------------------------------------------------------------------------------------------
+
+TIMES = np.linspace(0, 10, 41)
+
+
+@pytest.fixture(scope="module")
+def ego(bent: City) -> NDArray[np.float64]:
+    route = bent.graph.route(bent.graph.straightest_path(np.random.default_rng(3), 4, 4))
+    return follow(route, 5 + 6 * TIMES)
+
+
+@pytest.fixture(scope="module")
+def traffic(bent: City, ego: NDArray[np.float64]) -> Traffic:
+    return plan_traffic(bent, np.random.default_rng(3), ego, duration_s=10.0)
+
+
+def test_nobody_runs_into_the_ego_vehicle(traffic: Traffic, ego: NDArray[np.float64]):
+    car = _box("car", ego + np.c_[1.4 * np.cos(ego[:, 2]), 1.4 * np.sin(ego[:, 2]), np.zeros(len(ego))])
+    for track in traffic.tracks:
+        gaps = shapely.distance(_box(track.kind, track.poses(TIMES)), car)
+        assert gaps.min() > 0.3, track.kind
+
+
+def test_nobody_runs_into_anybody(traffic: Traffic):
+    """Except walkers on one sidewalk, who find a way around each other."""
+    boxes = {track.instance: _box(track.kind, track.poses(TIMES)) for track in traffic.tracks}
+    for one, other in itertools.combinations(traffic.tracks, 2):
+        if not all(KINDS[track.kind].category.startswith("human") for track in (one, other)):
+            assert not shapely.intersects(boxes[one.instance], boxes[other.instance]).any(), (one.kind, other.kind)
+
+
+def test_cyclists_find_room(traffic: Traffic):
+    assert sum(track.kind == "cyclist" for track in traffic.tracks) >= 6
+
+
+def test_some_vehicles_stop_before_a_line_and_drive_on(traffic: Traffic):
+    motions = [
+        {track.motion(time) for time in TIMES.tolist()}
+        for track in traffic.tracks
+        if KINDS[track.kind].category == "vehicle.car" and track.is_moving
+    ]
+    assert {"moving", "stopped"} in motions
+    assert {"moving"} in motions
+
+
+def test_some_pedestrians_are_on_the_road_but_only_on_crossings(bent: City, traffic: Traffic):
+    crossings = unary_union([polygon for polygon, _ in bent.layers.crossings]).buffer(1.0)
+    walkers = [track for track in traffic.tracks if track.kind in ("pedestrian", "child")]
+    places = [Point(place) for track in walkers for place in track.poses(TIMES)[:, :2]]
+    on_road = [place for place in places if bent.layers.road.buffer(-0.5).contains(place)]
+    assert on_road
+    assert all(crossings.contains(place) for place in on_road)
+
+
+def test_every_category_of_occupancy_benchmarks_occurs_in_a_few_drives(bent: City, ego: NDArray[np.float64]):
+    kinds = {
+        track.kind
+        for seed in range(6)
+        for track in plan_traffic(bent, np.random.default_rng(seed), ego[:1], duration_s=0.0).tracks
+    }
+    assert kinds == set(KINDS)
+
+
+def test_actors_stand_on_what_is_under_them(bent: City, traffic: Traffic, ego: NDArray[np.float64]):
+    for actor in traffic.actors(2.0, ego[0, :2]):
+        assert actor.ground_m == bent.surface_m(actor.x_m, actor.y_m)
+        assert foot_of(actor)[2] == pytest.approx(actor.ground_m + 0.02)
+
+
+def _box(kind: str, poses: NDArray[np.float64]) -> NDArray[np.object_]:
+    """Outlines of an actor at its poses."""
+    length, width = KINDS[kind].length_m / 2, KINDS[kind].width_m / 2
+    corners = np.array([[length, width], [-length, width], [-length, -width], [length, -width]])
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    turned = corners @ np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
+    return np.asarray(shapely.polygons(turned + poses[:, None, :2]))
