@@ -14,8 +14,9 @@ from presight_core.synthetic.city import City
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, MeshBuilder, Surface
 from presight_core.synthetic.occupancy import CLASSES, FREE, SHAPE, CitySurfaces, Moment, Occupancy, label_occupancy
+from presight_core.synthetic.raster import draw_perspective
 from presight_core.synthetic.raycast import RayCaster, Rays
-from presight_core.synthetic.renderer import Renderer, Views
+from presight_core.synthetic.renderer import ground_truth, pinhole_view
 from presight_core.synthetic.rig import RIG, rig_cameras
 from presight_core.synthetic.style import CityStyle
 from presight_core.synthetic.surface_points import (
@@ -39,11 +40,6 @@ def view(city: City) -> View:
 
 
 @pytest.fixture(scope="module")
-def views(city: City, view: View) -> Views:
-    return Renderer(city).render(view.cameras, view.lighting, view.actors)
-
-
-@pytest.fixture(scope="module")
 def world_from_ego(view: View) -> np.ndarray:
     return view.cameras[0].world_from_camera @ invert(RIG[0].ego_from_camera)
 
@@ -51,6 +47,21 @@ def world_from_ego(view: View) -> np.ndarray:
 @pytest.fixture(scope="module")
 def moment(city: City, view: View) -> Moment:
     return Moment(CitySurfaces(city), view.actors)
+
+
+@pytest.fixture(scope="module")
+def views(moment: Moment, view: View) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Depth and instances (H * W,) of each camera, as the renderer has them; nothing here needs colours."""
+    drawn = []
+    city_mesh, actors = moment.surfaces.mesh, moment.actor_mesh
+    for camera in view.cameras:
+        shape = 2 * camera.height_px + 1, 2 * camera.width_px + 1
+        nearness, faces = np.zeros(shape, np.float32), np.full(shape, -1, np.int32)
+        draw_perspective(city_mesh, pinhole_view(camera), 0, nearness, faces)
+        draw_perspective(actors, pinhole_view(camera), len(city_mesh.faces), nearness, faces)
+        depth_m, _, instances = ground_truth(city_mesh, actors, nearness[1::2, 1::2], faces[1::2, 1::2])
+        drawn.append((depth_m.reshape(-1).astype(np.float64), instances.reshape(-1)))
+    return drawn
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +108,10 @@ def test_a_caster_of_nothing_hits_nothing():
     assert np.isinf(hits.distance_m[0])
 
 
-def test_rays_through_pixels_are_as_long_as_the_rendered_depth(moment: Moment, view: View, views: Views):
-    for camera, depth_m in zip(view.cameras, views.depth_m, strict=True):
+def test_rays_through_pixels_are_as_long_as_the_rendered_depth(moment: Moment, view: View, views: list):
+    for camera, (depth_m, _) in zip(view.cameras, views, strict=True):
         origin, directions = camera.rays(pixel_centres(camera.width_px, camera.height_px))
-        along_m = depth_m.reshape(-1) / (directions @ camera.world_from_camera[:3, 2])
+        along_m = depth_m / (directions @ camera.world_from_camera[:3, 2])
         cast_m = moment.caster.cast(origin, directions).distance_m
         near = (along_m > 0) & (along_m < 100)
         off_m = np.abs(cast_m - along_m)[near]
@@ -219,17 +230,16 @@ def voxels_of(points_world: np.ndarray, world_from_ego: np.ndarray) -> tuple[np.
 
 
 def test_what_cameras_see_is_occupied_and_of_its_class(
-    moment: Moment, view: View, views: Views, world_from_ego: np.ndarray, labels: Occupancy
+    moment: Moment, view: View, views: list, world_from_ego: np.ndarray, labels: Occupancy
 ):
     expected, found, observed = [], [], []
     classes = occupancy.static_classes(moment.surfaces.mesh)
-    for number, camera in enumerate(view.cameras):
+    for camera, (depth_m, instances) in zip(view.cameras, views, strict=True):
         origin, directions = camera.rays(pixel_centres(camera.width_px, camera.height_px))
-        depth_m = views.depth_m[number].reshape(-1)
         points = origin + directions * (depth_m / (directions @ camera.world_from_camera[:3, 2]))[:, None]
         voxels, inside = voxels_of(points, world_from_ego)
         faces = moment.caster.cast(origin, directions).faces
-        inside &= (depth_m > 0) & (views.instances[number].reshape(-1) < FIRST_ACTOR)
+        inside &= (depth_m > 0) & (instances < FIRST_ACTOR)
         inside &= (faces >= 0) & (faces < len(classes))
         place = tuple(voxels[inside].T)
         expected.append(classes[faces[inside]])
