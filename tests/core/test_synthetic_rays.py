@@ -151,6 +151,17 @@ def test_low_rings_are_steep(sweep: lidar.Sweep):
     np.testing.assert_allclose(means, [lidar.LOWEST_DEG, lidar.HIGHEST_DEG], atol=0.01)
 
 
+def test_rays_go_out_in_the_order_of_a_real_sweep(shared_data: Path):
+    path = next((shared_data / "nuscenes-keyframe" / "samples" / "LIDAR_TOP").glob("*.pcd.bin"))
+    real = np.fromfile(path, np.float32).reshape(-1, 5)
+    directions, rings = lidar._directions()
+    np.testing.assert_array_equal(real[:, 4], rings)
+    range_m = np.linalg.norm(real[:, :3], axis=1, keepdims=True)
+    far = range_m[:, 0] > 5  # nearer, the laser's own offset turns the direction
+    cosine = np.einsum("ni,ni->n", real[:, :3] / np.maximum(range_m, 0.1), directions)
+    assert np.rad2deg(np.arccos(np.quantile(cosine[far], 0.05))) < 10  # the laser's start wanders by some degrees
+
+
 def test_a_sweep_comes_back_with_its_seed(moment: Moment, world_from_ego: np.ndarray, sweep: lidar.Sweep):
     world_from_lidar = world_from_ego @ lidar.ego_from_lidar()
     again = lidar.sweep(moment.caster, world_from_lidar, np.random.default_rng(0))
@@ -308,3 +319,10 @@ def test_written_labels_have_the_three_arrays_of_occ3d(tmp_path: Path, labels: O
             assert file[name].shape == SHAPE
             assert file[name].dtype == np.uint8
         np.testing.assert_array_equal(file["semantics"], labels.semantics)
+
+
+def test_an_empty_street_has_labels_too(moment: Moment, world_from_ego: np.ndarray):
+    nothing = Rays(np.zeros(3), np.zeros((0, 3)), np.zeros(0, np.float32))
+    labels = label_occupancy(Moment(moment.surfaces, []), world_from_ego, [], nothing)
+    assert labels.semantics[labels.semantics != FREE].min() >= occupancy.FIRST_STATIC
+    assert not labels.mask_camera.any()
