@@ -66,7 +66,8 @@ def write_sweep(path: Path, points: NDArray[np.float32]) -> None:
 def _directions() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Unit directions (AZIMUTH_COUNT * BEAM_COUNT, 3) in the lidar frame, a firing after the other, and their rings."""
     elevation = np.deg2rad(np.linspace(LOWEST_DEG, HIGHEST_DEG, BEAM_COUNT))
-    azimuth = -np.arange(AZIMUTH_COUNT)[:, None] * 2 * np.pi / AZIMUTH_COUNT  # clockwise seen from above
+    # As real sweeps: from the car's left clockwise, seen from above.
+    azimuth = np.pi - np.arange(AZIMUTH_COUNT)[:, None] * 2 * np.pi / AZIMUTH_COUNT
     x, y = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
     directions = np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], -1)
     return directions.reshape(-1, 3), np.tile(np.arange(BEAM_COUNT), AZIMUTH_COUNT)

@@ -34,7 +34,7 @@ VOXEL_M = 0.4
 REACH_M = 57.0  # from the car to a corner of the grid
 FAR_GROUND = (0.015, 0.10)  # below the horizon at depth 1: where cameras see the ground 15 to 90 m away
 FAR_GROUND_ROWS = 56  # 3.5 % apart; a curb ends 5 cm below its voxel's top, 3.7 % of a camera's height above it
-SPACING_M = 0.14  # of surface points: eight on a voxel's face
+SPACING_M = 0.12  # of surface points: eleven on a voxel's face
 ACTOR_SPACING_M = 0.08  # a bicycle's frame is 5 cm wide
 
 _CLASS_OF_LABEL = np.zeros(256, np.uint8)
@@ -121,7 +121,10 @@ class Moment:
 def label_occupancy(
     moment: Moment, world_from_ego: NDArray[np.float64], camera_rays: Sequence[Rays], lidar_rays: Rays
 ) -> Occupancy:
-    """Labels around an ego pose (4, 4), which should stand on the ground that the sensors stood on."""
+    """Labels around an ego pose (4, 4), the one of the lidar's keyframe, standing on the ground as the sensors did.
+
+    Each camera may look from where it was when it fired; the actors hold still meanwhile.
+    """
     voxel_from_world = _voxel_from_ego() @ invert(world_from_ego)
     votes = np.zeros((*SHAPE, FREE), np.uint16)
     for samples in moment.samples(world_from_ego[:2, 3]):

@@ -14,8 +14,9 @@ from presight_core.synthetic.city import City
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, MeshBuilder, Surface
 from presight_core.synthetic.occupancy import CLASSES, FREE, SHAPE, CitySurfaces, Moment, Occupancy, label_occupancy
+from presight_core.synthetic.raster import draw_perspective
 from presight_core.synthetic.raycast import RayCaster, Rays
-from presight_core.synthetic.renderer import Renderer, Views
+from presight_core.synthetic.renderer import ground_truth, pinhole_view
 from presight_core.synthetic.rig import RIG, rig_cameras
 from presight_core.synthetic.style import CityStyle
 from presight_core.synthetic.surface_points import (
@@ -39,11 +40,6 @@ def view(city: City) -> View:
 
 
 @pytest.fixture(scope="module")
-def views(city: City, view: View) -> Views:
-    return Renderer(city).render(view.cameras, view.lighting, view.actors)
-
-
-@pytest.fixture(scope="module")
 def world_from_ego(view: View) -> np.ndarray:
     return view.cameras[0].world_from_camera @ invert(RIG[0].ego_from_camera)
 
@@ -51,6 +47,21 @@ def world_from_ego(view: View) -> np.ndarray:
 @pytest.fixture(scope="module")
 def moment(city: City, view: View) -> Moment:
     return Moment(CitySurfaces(city), view.actors)
+
+
+@pytest.fixture(scope="module")
+def views(moment: Moment, view: View) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Depth and instances (H * W,) of each camera, as the renderer has them; nothing here needs colours."""
+    drawn = []
+    city_mesh, actors = moment.surfaces.mesh, moment.actor_mesh
+    for camera in view.cameras:
+        shape = 2 * camera.height_px + 1, 2 * camera.width_px + 1
+        nearness, faces = np.zeros(shape, np.float32), np.full(shape, -1, np.int32)
+        draw_perspective(city_mesh, pinhole_view(camera), 0, nearness, faces)
+        draw_perspective(actors, pinhole_view(camera), len(city_mesh.faces), nearness, faces)
+        depth_m, _, instances = ground_truth(city_mesh, actors, nearness[1::2, 1::2], faces[1::2, 1::2])
+        drawn.append((depth_m.reshape(-1).astype(np.float64), instances.reshape(-1)))
+    return drawn
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +108,10 @@ def test_a_caster_of_nothing_hits_nothing():
     assert np.isinf(hits.distance_m[0])
 
 
-def test_rays_through_pixels_are_as_long_as_the_rendered_depth(moment: Moment, view: View, views: Views):
-    for camera, depth_m in zip(view.cameras, views.depth_m, strict=True):
+def test_rays_through_pixels_are_as_long_as_the_rendered_depth(moment: Moment, view: View, views: list):
+    for camera, (depth_m, _) in zip(view.cameras, views, strict=True):
         origin, directions = camera.rays(pixel_centres(camera.width_px, camera.height_px))
-        along_m = depth_m.reshape(-1) / (directions @ camera.world_from_camera[:3, 2])
+        along_m = depth_m / (directions @ camera.world_from_camera[:3, 2])
         cast_m = moment.caster.cast(origin, directions).distance_m
         near = (along_m > 0) & (along_m < 100)
         off_m = np.abs(cast_m - along_m)[near]
@@ -138,6 +149,17 @@ def test_low_rings_are_steep(sweep: lidar.Sweep):
     elevation = np.arcsin(sweep.points[:, 2] / np.linalg.norm(sweep.points[:, :3], axis=1))
     means = [np.rad2deg(elevation[sweep.points[:, 4] == ring].mean()) for ring in (0, 31)]
     np.testing.assert_allclose(means, [lidar.LOWEST_DEG, lidar.HIGHEST_DEG], atol=0.01)
+
+
+def test_rays_go_out_in_the_order_of_a_real_sweep(shared_data: Path):
+    path = next((shared_data / "nuscenes-keyframe" / "samples" / "LIDAR_TOP").glob("*.pcd.bin"))
+    real = np.fromfile(path, np.float32).reshape(-1, 5)
+    directions, rings = lidar._directions()
+    np.testing.assert_array_equal(real[:, 4], rings)
+    range_m = np.linalg.norm(real[:, :3], axis=1, keepdims=True)
+    far = range_m[:, 0] > 5  # nearer, the laser's own offset turns the direction
+    cosine = np.einsum("ni,ni->n", real[:, :3] / np.maximum(range_m, 0.1), directions)
+    assert np.rad2deg(np.arccos(np.quantile(cosine[far], 0.05))) < 10  # the laser's start wanders by some degrees
 
 
 def test_a_sweep_comes_back_with_its_seed(moment: Moment, world_from_ego: np.ndarray, sweep: lidar.Sweep):
@@ -219,17 +241,16 @@ def voxels_of(points_world: np.ndarray, world_from_ego: np.ndarray) -> tuple[np.
 
 
 def test_what_cameras_see_is_occupied_and_of_its_class(
-    moment: Moment, view: View, views: Views, world_from_ego: np.ndarray, labels: Occupancy
+    moment: Moment, view: View, views: list, world_from_ego: np.ndarray, labels: Occupancy
 ):
     expected, found, observed = [], [], []
     classes = occupancy.static_classes(moment.surfaces.mesh)
-    for number, camera in enumerate(view.cameras):
+    for camera, (depth_m, instances) in zip(view.cameras, views, strict=True):
         origin, directions = camera.rays(pixel_centres(camera.width_px, camera.height_px))
-        depth_m = views.depth_m[number].reshape(-1)
         points = origin + directions * (depth_m / (directions @ camera.world_from_camera[:3, 2]))[:, None]
         voxels, inside = voxels_of(points, world_from_ego)
         faces = moment.caster.cast(origin, directions).faces
-        inside &= (depth_m > 0) & (views.instances[number].reshape(-1) < FIRST_ACTOR)
+        inside &= (depth_m > 0) & (instances < FIRST_ACTOR)
         inside &= (faces >= 0) & (faces < len(classes))
         place = tuple(voxels[inside].T)
         expected.append(classes[faces[inside]])
@@ -298,3 +319,10 @@ def test_written_labels_have_the_three_arrays_of_occ3d(tmp_path: Path, labels: O
             assert file[name].shape == SHAPE
             assert file[name].dtype == np.uint8
         np.testing.assert_array_equal(file["semantics"], labels.semantics)
+
+
+def test_an_empty_street_has_labels_too(moment: Moment, world_from_ego: np.ndarray):
+    nothing = Rays(np.zeros(3), np.zeros((0, 3)), np.zeros(0, np.float32))
+    labels = label_occupancy(Moment(moment.surfaces, []), world_from_ego, [], nothing)
+    assert labels.semantics[labels.semantics != FREE].min() >= occupancy.FIRST_STATIC
+    assert not labels.mask_camera.any()
