@@ -39,7 +39,7 @@ from presight_core.synthetic.shooting import Shooting
 from presight_core.synthetic.surface_points import Bounds, exposed, sample_surface, write_surface_points
 
 FORMAT = 2  # raise it when the same preset and seed would give other files
-SURFACE_SPACING_M = 0.2  # half a voxel of the prior
+SURFACE_SPACING_M = 0.25  # finer than the voxels of a prior, 0.4 m
 SHADOW_MARGIN_M = 130.0  # past the ends of a drive
 
 
@@ -170,7 +170,7 @@ class _TownWork:
 
     def _write_surface(self, file: Path) -> None:
         size_m = self.city.style.size_m
-        bounds = Bounds((0.0, 0.0, -5.0), (size_m, size_m, 100.0))  # the map, without the skyline around it
+        bounds = Bounds((0.0, 0.0, -5.0), (size_m, size_m, 20.0))  # as high as priors reach, and no skyline
         samples = sample_surface(self.city.mesh, SURFACE_SPACING_M, bounds)
         file.parent.mkdir(exist_ok=True)
         write_surface_points(file, samples.select(exposed(samples, self.surfaces.caster)))
