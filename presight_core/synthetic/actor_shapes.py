@@ -122,6 +122,13 @@ def _wheel(x: float, y: float, radius: float, width: float) -> tuple[NDArray, ND
     return turned + np.array([x, y, radius]), faces[:, ::-1]
 
 
+def _tube(a: tuple[float, float], b: tuple[float, float]) -> tuple[NDArray, NDArray]:
+    """A square tube 6 cm thick between two places (x, z) in the middle plane."""
+    start, end = np.array(a), np.array(b)
+    across = 0.03 * np.array([start[1] - end[1], end[0] - start[0]]) / np.linalg.norm(end - start)
+    return _prism([start - across, start + across, end + across, end - across], [0.03] * 4)
+
+
 def _ball(x: float, y: float, z: float, radius: float) -> tuple[NDArray, NDArray]:
     vertices, faces = sphere(1)
     return vertices * radius + np.array([x, y, z]), faces
@@ -230,8 +237,12 @@ def _make_child(template: _Template, kind: ActorKind) -> None:
 def _make_bicycle(template: _Template, kind: ActorKind) -> None:
     for x in (-0.52, 0.52):
         template.add(_wheel(x, 0, 0.34, 0.05), Material.TYRE, kind.label, RUBBER)
-    frame = [(-0.52, 0.30), (-0.15, 0.84), (0.40, 0.88), (0.52, 0.34), (0.40, 0.66), (-0.05, 0.34)]
-    template.add(_prism(frame, [0.025] * 6), Material.CAR_PAINT, kind.label, PAINT)
+    seat, head, pedals = (-0.2, 0.86), (0.38, 0.86), (-0.06, 0.3)
+    tubes = ((pedals, seat), (pedals, head), (seat, head), ((-0.52, 0.34), seat), ((-0.52, 0.34), pedals),
+             (head, (0.52, 0.34)), (head, (0.4, 1.0)))  # fmt: skip
+    for tube in tubes:
+        template.add(_tube(*tube), Material.CAR_PAINT, kind.label, PAINT)
+    template.add(_box(-0.22, 0, 0.86, (0.26, 0.14, 0.07)), Material.TYRE, kind.label, RUBBER)  # saddle
     template.add(_box(0.42, 0, 0.98, (0.06, 0.55, 0.05)), Material.TYRE, kind.label, RUBBER)
     if kind.has_rider:
         template.origin_m = (-0.15, 0.0, 0.22)  # feet on the pedals

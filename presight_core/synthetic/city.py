@@ -5,7 +5,7 @@ World metres, x east, y north, z up; the origin is the map's south-west corner, 
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from presight_core.synthetic.blocks import Site, fill_block
 from presight_core.synthetic.buildings import Building, add_building
@@ -54,10 +54,10 @@ class City:
         """Height of the road surface at a place."""
         return float(self.terrain.height_m(x_m, y_m))
 
-    def surface_m(self, x_m: float, y_m: float) -> float:
-        """Height of what one stands on at a place: the road, or a curb higher, all else."""
-        is_road = bool(shapely.contains_xy(self.layers.road, x_m, y_m))
-        return self.height_m(x_m, y_m) + (0.0 if is_road else CURB_M)
+    def surface_m(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
+        """Height of what one stands on at places (...,): the road, or a curb higher, all else."""
+        is_road = shapely.contains_xy(self.layers.road, np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
+        return self.terrain.height_m(x_m, y_m) + np.where(is_road, 0.0, CURB_M)
 
 
 def _lay_surfaces(site: Site, layers: StreetLayers) -> None:

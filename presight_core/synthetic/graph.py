@@ -226,4 +226,4 @@ def follow(route: NDArray[np.float64], along_m: NDArray[np.float64]) -> NDArray[
     last_m = (len(route) - 1) * ROUTE_STEP_M - 2.0  # beyond, there is no place to look ahead to
     along_m = np.clip(along_m, 0, last_m)
     ahead = point(along_m + 2.0) - point(along_m)
-    return np.c_[point(along_m), np.arctan2(ahead[:, 1], ahead[:, 0])]
+    return np.column_stack([point(along_m), np.arctan2(ahead[:, 1], ahead[:, 0])])

@@ -36,7 +36,7 @@ class Terrain:
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
         """Height of the road surface at places (...,)."""
-        return np.sin(self._angles(x_m, y_m)) @ self._amplitudes_m
+        return (np.sin(self._angles(x_m, y_m)) * self._amplitudes_m).sum(-1)
 
     def lowest_m(self, points: NDArray[np.float64]) -> float:
         """The least height at any of the points (N, 2)."""
@@ -74,7 +74,8 @@ class Terrain:
         return float(min(np.sqrt(8 * SAG_M / max(bend, 1e-12) / 2), LARGEST_CELL_M))  # sagitta over a diagonal
 
     def _angles(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
-        return np.stack([np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)], -1) @ self._waves.T + self._phases
+        x, y = np.asarray(x_m, np.float64)[..., None], np.asarray(y_m, np.float64)[..., None]
+        return x * self._waves[:, 0] + y * self._waves[:, 1] + self._phases  # no matmul: it rounds as it likes
 
 
 def triangulate(polygon: Polygon) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

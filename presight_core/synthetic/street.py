@@ -1,6 +1,7 @@
 """One street: a centre line that bends, and places beside it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,17 +25,16 @@ class Street:
 
     def at(self, along_m: ArrayLike, left_m: ArrayLike = 0.0) -> NDArray[np.float64]:
         """Points (..., 2) this far along the street and this far to its left."""
-        return self._between(self.points, along_m) + np.asarray(left_m)[..., None] * self.left_at(along_m)
+        frame = self._frame(along_m)
+        return frame[..., :2] + np.asarray(left_m)[..., None] * _left_of(frame[..., 2:])
 
     def tangent_at(self, along_m: ArrayLike) -> NDArray[np.float64]:
         """Unit tangents (..., 2)."""
-        tangent = self._between(self.tangents, along_m)
-        return tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
+        return self._frame(along_m)[..., 2:]
 
     def left_at(self, along_m: ArrayLike) -> NDArray[np.float64]:
         """Unit normals (..., 2) to the left."""
-        tangent = self.tangent_at(along_m)
-        return np.stack([-tangent[..., 1], tangent[..., 0]], -1)
+        return _left_of(self.tangent_at(along_m))
 
     def yaw_at(self, along_m: float) -> float:
         """Heading in radians, counter-clockwise from east."""
@@ -47,25 +47,40 @@ class Street:
 
     def strip(self, along_m: tuple[float, float], left_m: tuple[float, float]) -> NDArray[np.float64]:
         """Corners (N, 2) of a band along the street; four on a straight run."""
-        return np.concatenate([self.beside(along_m, left_m[0]), self.beside(along_m, left_m[1])[::-1]])
+        frame = self._frame(self._steps(*along_m))
+        points, left = frame[:, :2], _left_of(frame[:, 2:])
+        return np.concatenate([points + left_m[0] * left, (points + left_m[1] * left)[::-1]])
 
     def reversed(self) -> "Street":
         """The same street seen from its other end."""
         return Street(self.points[::-1], self.length_m - self.along_m[::-1], -self.tangents[::-1])
 
-    def _between(self, values: NDArray[np.float64], along_m: ArrayLike) -> NDArray[np.float64]:
-        return np.stack(
-            [np.interp(np.asarray(along_m, np.float64), self.along_m, values[:, axis]) for axis in (0, 1)], -1
-        )
+    @cached_property
+    def _frames(self) -> NDArray[np.float64]:
+        return np.concatenate([self.points, self.tangents], axis=1)
+
+    def _frame(self, along_m: ArrayLike) -> NDArray[np.float64]:
+        """Points and unit tangents (..., 4), between those that are known."""
+        along_m = np.asarray(along_m, np.float64)
+        after = np.clip(np.searchsorted(self.along_m, along_m), 1, len(self.along_m) - 1)
+        start, end = self.along_m[after - 1], self.along_m[after]
+        share = ((along_m - start) / (end - start))[..., None]
+        frame = self._frames[after - 1] * (1 - share) + self._frames[after] * share
+        frame[..., 2:] /= np.hypot(frame[..., 2], frame[..., 3])[..., None]
+        return frame
 
     def _steps(self, start_m: float, end_m: float) -> NDArray[np.float64]:
-        low, high = sorted((start_m, end_m))
-        inside = self.tangents[(self.along_m > low) & (self.along_m < high)]
-        headings = np.concatenate([self.tangent_at([low, high]), inside])
-        turn = np.ptp(headings @ self.left_at((low + high) / 2))  # sine of the angle
-        is_straight = turn * (high - low) / 8 < STRAIGHT_M  # sagitta of an arc
-        pieces = 1 if is_straight else max(2, int(np.ceil((high - low) / PIECE_M)))
+        length_m = abs(end_m - start_m)
+        pieces = 1
+        if length_m**2 / (8 * RADIUS_M) > STRAIGHT_M:  # the sagitta of the tightest arc: then look at the true one
+            tangents = self.tangent_at(np.linspace(start_m, end_m, int(length_m) + 2))
+            turn = np.ptp(tangents @ _left_of(tangents[len(tangents) // 2]))  # sine of the angle
+            pieces = max(2, int(np.ceil(length_m / PIECE_M))) if turn * length_m / 8 > STRAIGHT_M else 1
         return np.linspace(start_m, end_m, pieces + 1)
+
+
+def _left_of(tangent: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([-tangent[..., 1], tangent[..., 0]], -1)
 
 
 def bent_street(

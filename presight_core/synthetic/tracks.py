@@ -36,7 +36,7 @@ class Track:
     def poses(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """x, y, yaw (T, 3) at the given times."""
         if self.profile is None:
-            return np.repeat(self.path[:1, :3], len(time_s), 0)
+            return np.broadcast_to(self.path[0], (len(time_s), 3))
         return follow(self.path, np.interp(time_s, *self.profile))
 
     def motion(self, time_s: float) -> Motion:

@@ -40,13 +40,15 @@ class Traffic:
 
     def actors(self, time_s: float, near: NDArray[np.float64]) -> list[Actor]:
         """Who is within reach of a place (2,) at a moment."""
-        moment = np.array([time_s])
+        poses = np.stack([track.poses(np.array([time_s]))[0] for track in self.tracks] or [np.zeros(3)])
+        is_near = np.hypot(*(poses[:, :2] - near).T) < REACH_M
+        grounds_m = self.city.surface_m(poses[:, 0], poses[:, 1])
         found = []
-        for track in self.tracks:
-            x, y, yaw = track.poses(moment)[0].tolist()
-            if np.hypot(x - near[0], y - near[1]) < REACH_M:
-                ground_m, motion = self.city.surface_m(x, y), track.motion(time_s)
-                found.append(Actor(track.kind, x, y, yaw, track.colour, track.instance, ground_m, motion))
+        for k in np.flatnonzero(is_near):
+            track, (x, y, yaw) = self.tracks[k], poses[k].tolist()
+            found.append(
+                Actor(track.kind, x, y, yaw, track.colour, track.instance, float(grounds_m[k]), track.motion(time_s))
+            )
         return found
 
 
