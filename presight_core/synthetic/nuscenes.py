@@ -32,6 +32,12 @@ ATTRIBUTES = (
     "vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider",
     "pedestrian.sitting_lying_down", "pedestrian.standing", "pedestrian.moving",
 )  # fmt: skip
+MAP_NAMES = {  # token and file name of each map's picture: the devkit looks for these and no others
+    "boston-seaport": "36092f0b03a857c6a3403e25b4b7aab3",
+    "singapore-hollandvillage": "37819e65e09e5547b8a3ceaefba56bb2",
+    "singapore-onenorth": "53992ee3023e5494b90c316c183be829",
+    "singapore-queenstown": "93406b464a165eaba6d9de76ca09f5da",
+}
 VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")  # share of the object that some camera sees, in percent
 
 Row = dict[str, Any]
@@ -91,7 +97,7 @@ def vocabulary_rows() -> Rows:
 
 def map_row(location: str, logs: Sequence[Row]) -> Row:
     """The row that ties logs to the picture of their map."""
-    name = token("map", location)
+    name = MAP_NAMES[location]
     return {
         "token": name,
         "log_tokens": [row["token"] for row in logs],
