@@ -1,7 +1,7 @@
 """The vector map of a city in the nuScenes map-expansion format, version 1.3."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 from shapely.geometry import LineString, Point, Polygon
-from shapely.ops import substring
+from shapely.ops import substring, unary_union
 
 from presight_core.synthetic.arclines import fit_arcs, row_from_arc
 from presight_core.synthetic.city import City
@@ -25,9 +25,6 @@ TABLES = (
     "polygon", "line", "node", "drivable_area", "road_segment", "road_block", "lane", "ped_crossing", "walkway",
     "stop_line", "carpark_area", "road_divider", "lane_divider", "traffic_light", "lane_connector",
 )  # fmt: skip
-
-# The format knows neither double yellow nor single dashed white lines; these are the nearest that it has.
-AXIS, BETWEEN_LANES, BESIDE_PARKING, CURB = "SINGLE_SOLID_YELLOW", "DOUBLE_DASHED_WHITE", "SINGLE_SOLID_WHITE", "NIL"
 
 
 def write_map_expansion(path: Path, city: City) -> None:
@@ -64,6 +61,9 @@ class _MapBuilder:
         self.nodes: dict[tuple[int, int], str] = {}  # by millimetres: lines and polygons that touch share nodes
         self.paths: dict[str, list[Row]] = {}
         self.connectivity: dict[str, dict[str, list[str]]] = {}
+        self.paints = [shapely.STRtree(paint) for paint in (self.layers.white_paint, self.layers.yellow_paint)]
+        crossings = [polygon for polygon, _ in self.layers.crossings]
+        self.crossed = unary_union(crossings).buffer(1.6)  # metres; up to the back of the stop line
 
     def build(self) -> dict[str, Any]:
         self._add_areas()
@@ -175,17 +175,13 @@ class _MapBuilder:
 
     def _add_lanes(self) -> None:
         for lane in self.layers.lanes:
-            count = self.graph.lanes(*lane.edge)
-            inner = AXIS if lane.number == 0 else BETWEEN_LANES
-            outer = BETWEEN_LANES if lane.number < count - 1 else BESIDE_PARKING if count == 1 else CURB
-            left, right = (inner, outer) if self.graph.drive_side < 0 else (outer, inner)
             row = {
                 "token": self._lane(lane),
                 "polygon_token": self._polygon(lane.polygon),
                 "lane_type": "CAR",
                 **self._edges(lane.left, lane.right),
-                "left_lane_divider_segments": self._divider(self._trace(lane.left), left),
-                "right_lane_divider_segments": self._divider(self._trace(lane.right), right),
+                "left_lane_divider_segments": self._divider(lane.left),
+                "right_lane_divider_segments": self._divider(lane.right),
             }
             self.tables["lane"].append(row)
             self._add_path(row["token"], lane_centre(lane))
@@ -197,9 +193,26 @@ class _MapBuilder:
             "to_edge_line_token": self._line([left[-1], right[-1]]),
         }
 
-    @staticmethod
-    def _divider(nodes: Sequence[str], kind: str) -> list[Row]:
-        return [{"node_token": node, "segment_type": kind} for node in nodes]
+    def _divider(self, points: NDArray[np.float64]) -> list[Row]:
+        kind = self._marking(LineString(points))
+        return [{"node_token": node, "segment_type": kind} for node in self._trace(points)]
+
+    def _marking(self, line: LineString) -> str:
+        """What is painted along a line, told by its mean width away from crossings.
+
+        The format knows neither double yellow nor single dashed white lines: these get the nearest name that it has.
+        """
+        strip = line.buffer(0.25, cap_style="flat").difference(self.crossed)  # 0.25: both halves of a double line
+        length_m = strip.area / 0.5
+        white_m, yellow_m = (
+            float(shapely.area(shapely.intersection(strip, tree.geometries[tree.query(strip)])).sum()) / length_m
+            for tree in self.paints
+        )
+        if yellow_m > 0.04:  # half of what dashes have
+            return "SINGLE_SOLID_YELLOW"
+        limits_m = (0.04, 0.10, 0.20)  # solid lines are 0.14 wide, dashes take half of that, double lines twice
+        kinds = "NIL", "DOUBLE_DASHED_WHITE", "SINGLE_SOLID_WHITE", "DOUBLE_SOLID_WHITE"
+        return kinds[int(np.searchsorted(limits_m, white_m))]
 
     def _add_path(self, name: str, centre: NDArray[np.float64], ends_rad: tuple[float, float] | None = None) -> None:
         self.paths[name] = [row_from_arc(arc) for arc in fit_arcs(centre, ends_rad)]
@@ -266,7 +279,7 @@ class _MapBuilder:
             ]
             arriving = min(
                 (lane for lane in self.layers.lanes if lane.edge == edge),
-                key=lambda lane: polygon.centroid.distance(Point(lane_centre(lane)[-1])),
+                key=lambda lane: polygon.centroid.distance(lane.polygon),
             )
             light = self._name("traffic_light", number)
             block = self._block(edge, arriving.forward)
@@ -283,12 +296,13 @@ class _MapBuilder:
 
     def _light(self, name: str, block: str, stop_line: Polygon, lane: Lane) -> Row:
         """The lamp over the lane: beside the stop line stands a mast whose arm reaches back over it."""
-        centre = lane_centre(lane)
-        heading = (centre[-1] - centre[-2]) / np.linalg.norm(centre[-1] - centre[-2])
-        outward = self.graph.drive_side * np.array([-heading[1], heading[0]])
         middle = np.array(stop_line.centroid.coords[0])
+        centre = lane_centre(lane)
+        step = int(np.linalg.norm(centre[:-1] + centre[1:] - 2 * middle, axis=1).argmin())  # the stretch beside it
+        heading = (centre[step + 1] - centre[step]) / np.linalg.norm(centre[step + 1] - centre[step])
+        outward = self.graph.drive_side * np.array([-heading[1], heading[0]])
         across_m = self.graph.half_width_m(*lane.edge) / 2 + 0.5 - 3.2  # mast half a metre behind the curb, arm 3.2 m
-        place = middle + 0.68 * heading + across_m * outward  # 0.68: the mast stands 3.9 m from the junction's mouth
+        place = middle + across_m * outward
         yaw_rad = float(np.arctan2(-heading[1], -heading[0]))
         ground_m = self.city.height_m(*place)
         return {
@@ -308,12 +322,11 @@ class _MapBuilder:
                 "road_segment_token": self._segment(edge),
             }
             self.tables["road_divider"].append(row)
-        for number, (points, edge) in enumerate(self.layers.lane_dividers):
-            kind = BESIDE_PARKING if self.graph.lanes(*edge) == 1 else BETWEEN_LANES
+        for number, (points, _) in enumerate(self.layers.lane_dividers):
             row = {
                 "token": self._name("lane_divider", number),
                 "line_token": self._line(points),
-                "lane_divider_segments": self._divider(self._trace(points), kind),
+                "lane_divider_segments": self._divider(points),
             }
             self.tables["lane_divider"].append(row)
 

@@ -181,11 +181,11 @@ def _middle_error_m(place: np.ndarray, outline: np.ndarray) -> float:
 
 def draw_map(nusc: NuScenes, nusc_map: NuScenesMap, pictures: Path) -> None:
     """Draw the map, and the map into an image."""
-    base = BitMap(nusc.dataroot, nusc_map.map_name, "basemap")
-    figure, _ = nusc_map.render_layers(nusc_map.non_geometric_layers, figsize=8, bitmap=base)
-    figure.savefig(pictures / "layers.png", dpi=100, bbox_inches="tight")
+    base, prior = (BitMap(nusc.dataroot, nusc_map.map_name, layer) for layer in ("basemap", "semantic_prior"))
+    figure, _ = nusc_map.render_layers(nusc_map.non_geometric_layers, figsize=8, bitmap=prior)
+    figure.savefig(pictures / "layers.png", bbox_inches="tight")
     figure, _ = nusc_map.render_centerlines(0.5, figsize=8, bitmap=base)
-    figure.savefig(pictures / "centre_lines.png", dpi=100, bbox_inches="tight")
+    figure.savefig(pictures / "centre_lines.png", bbox_inches="tight")
     sample = nusc.sample[len(nusc.sample) // 2]
     layers = ["road_segment", "ped_crossing", "walkway", "stop_line"]
     nusc_map.render_map_in_image(
