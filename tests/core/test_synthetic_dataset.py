@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 from presight_core.cameras import Camera, pixel_centres
+from presight_core.classes import CITYSCAPES
 from presight_core.errors import SettingsError
 from presight_core.frames import rotation_from_quaternion, transform
+from presight_core.nuscenes_split import TEST_SCENES
 from presight_core.progress import Progress
 from presight_core.synthetic import load_preset, write_dataset
 from presight_core.synthetic.actors import FIRST_ACTOR
+from presight_core.synthetic.city import City
+from presight_core.synthetic.drive_plan import plan_drive, plan_streets
 from presight_core.synthetic.nuscenes import TABLES
+from presight_core.synthetic.surface_points import read_surface_points
 
 SMALL = ("keyframes=3", "width_px=96", "height_px=54")
 TINY = load_preset("ci", SMALL)
@@ -170,7 +175,8 @@ def test_an_interrupted_run_is_finished_by_running_it_again(root: Path, tmp_path
     with pytest.raises(Interrupted):
         write_dataset(tmp_path, TINY, seed=5, report=stop_in_second_drive, threads=1)
     assert not (tmp_path / VERSION).exists()
-    finished = {path: path.stat().st_mtime_ns for path in (tmp_path / "synth_gt" / "scene-0001").iterdir()}
+    kept = [*(tmp_path / "synth_gt" / "scene-0001").iterdir(), *tmp_path.glob("samples/CAM_FRONT/*.jpg")]
+    finished = {path: path.stat().st_mtime_ns for path in kept}
     write_dataset(tmp_path, TINY, seed=5, threads=1)
     assert files_of(tmp_path) == files_of(root)
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
@@ -207,3 +213,98 @@ def test_sweeps_fill_the_time_between_keyframes(tmp_path: Path):
     assert [row["next"] for row in front[:-1]] == [row["token"] for row in front[1:]]
     truths = list((tmp_path / "synth_gt").rglob("*.npz"))
     assert len(truths) == 12  # keyframes only
+
+
+# ---- all that a data set can hold --------------------------------------------------------------------------------
+
+FULL = load_preset(
+    "ci",
+    [
+        *SMALL, "keyframes=2", "lidar=true", "occupancy=true", "surface=true", "paper_split=true",
+        'towns.singapore-onenorth.train=[]', 'towns.singapore-onenorth.test=["night"]',
+        'towns.boston-seaport={train=["day"], style={size_m=200.0, spacing_m=90.0, left_hand=false}}',
+    ],
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("full")
+    write_dataset(folder, FULL, seed=1, threads=2)
+    return folder
+
+
+def rows_of(root: Path, table: str) -> list[dict]:
+    return json.loads((root / FULL.version / f"{table}.json").read_text())
+
+
+def test_each_city_has_its_own_logs_and_maps(full: Path):
+    logs = {row["token"]: row["location"] for row in rows_of(full, "log")}
+    assert sorted(logs.values()) == ["boston-seaport", "singapore-onenorth"]
+    for row in rows_of(full, "map"):
+        assert len({logs[token] for token in row["log_tokens"]}) == 1
+        assert (full / row["filename"]).is_file()
+    for location in logs.values():
+        assert (full / "maps" / "expansion" / f"{location}.json").is_file()
+
+
+def test_scene_names_follow_the_papers_split(full: Path):
+    names = {row["name"] for row in rows_of(full, "scene")}
+    assert len(names) == 2
+    assert len(names & set(TEST_SCENES)) == 1
+
+
+def test_lidar_points_lie_on_the_boxes_that_count_them(full: Path):
+    calibration = next(r for r in rows_of(full, "calibrated_sensor") if r["camera_intrinsic"] == [])
+    ego_from_lidar = transform(rotation_from_quaternion(calibration["rotation"]), calibration["translation"])
+    poses = {row["token"]: row for row in rows_of(full, "ego_pose")}
+    checked = 0
+    for file in (row for row in rows_of(full, "sample_data") if row["fileformat"] == "pcd"):
+        points = np.fromfile(full / file["filename"], np.float32).reshape(-1, 5)[:, :3].astype(np.float64)
+        pose = poses[file["ego_pose_token"]]
+        world_from_lidar = transform(rotation_from_quaternion(pose["rotation"]), pose["translation"]) @ ego_from_lidar
+        world = points @ world_from_lidar[:3, :3].T + world_from_lidar[:3, 3]
+        for box in rows_of(full, "sample_annotation"):
+            if box["sample_token"] == file["sample_token"] and box["num_lidar_pts"] > 20:
+                world_from_box = transform(rotation_from_quaternion(box["rotation"]), box["translation"])
+                local = (world - world_from_box[:3, 3]) @ world_from_box[:3, :3]
+                half = np.array(box["size"])[[1, 0, 2]] / 2 + 0.1  # a hand's breadth: the lidar's noise
+                inside = int((np.abs(local) < half).all(1).sum())
+                assert inside >= 0.9 * box["num_lidar_pts"]
+                checked += 1
+    assert checked > 3
+
+
+def test_occupancy_lies_where_occ3d_has_it_and_covers_the_road_under_the_car(full: Path):
+    scenes = {row["token"]: row["name"] for row in rows_of(full, "scene")}
+    for sample in rows_of(full, "sample"):
+        with np.load(full / "gts" / scenes[sample["scene_token"]] / sample["token"] / "labels.npz") as labels:
+            assert sorted(labels) == ["mask_camera", "mask_lidar", "semantics"]
+            under = labels["semantics"][95:105, 95:105, 1:4]  # 4 m around the car, -0.6 to 0.6 m
+            assert (under == 11).any(axis=2).mean() > 0.9  # 11: driveable_surface
+
+
+def test_surface_points_cover_the_streets(full: Path):
+    points, labels = read_surface_points(full / "synth_gt" / "surface" / "boston-seaport.npz")
+    assert points.shape == (len(labels), 3)
+    assert (labels == CITYSCAPES.index("road")).sum() > 10_000
+    assert points[labels == CITYSCAPES.index("road"), 2].max() < 0.5
+
+
+def test_the_contact_sheet_is_drawn(full: Path):
+    assert cv2.imread(str(full / "contact_sheet.png")).std() > 30
+
+
+@pytest.mark.parametrize("true_height", [False, True])
+def test_recorded_poses_tilt_with_the_ground_and_tell_its_height_only_if_asked(true_height: bool):
+    preset = load_preset(
+        "ci", [f"true_height={str(true_height).lower()}", "towns.singapore-onenorth.style.relief_m=0.5"]
+    )
+    town = preset.towns["singapore-onenorth"]
+    city = City(4, town.style)
+    plan = plan_drive(city, preset, plan_streets(city, town, preset.keyframes), preset.drives[0])
+    true, recorded = plan.world_from_ego(1.0), plan.recorded_pose(1.0)
+    np.testing.assert_array_equal(recorded[:3, :3], true[:3, :3])
+    assert abs(true[2, 3]) > 0.01
+    assert recorded[2, 3] == (true[2, 3] if true_height else 0.0)
+    assert 1e-4 < np.hypot(*true[:2, 2]) < 0.02  # the car's up axis leans
