@@ -22,7 +22,7 @@ FIRST_UNSEEN_SEED = 1_000_000  # cities from here on are for measuring only
 RARE_SHARE = 0.08  # of the cars; more, and cars are taken for buses
 EXTRA_INSTANCE = 500_000  # instance numbers of added actors follow the traffic's own
 
-Change = Callable[[View, np.random.Generator], View]
+Change = Callable[[City, View, np.random.Generator], View]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def _rendered(rig_count: int, seed: int, threads: int, change: Change) -> Iterat
             rng = np.random.default_rng([seed, k])
             city = City(seed + k, CityStyle.random(rng, CITY_M))
             renderer = Renderer(city)
-            views = [change(random_view(city, rng, WIDTH_PX), rng) for _ in range(count)]
+            views = [change(city, random_view(city, rng, WIDTH_PX), rng) for _ in range(count)]
             noise_seeds = rng.integers(2**31, size=count).tolist()
             for shot in pool.map(partial(_shoot, renderer), views, noise_seeds):
                 yield LabelledImages(shot.rgb, shot.labels)
@@ -61,13 +61,13 @@ def _shoot(renderer: Renderer, view: View, noise_seed: int) -> Views:
     return renderer.render(view.cameras, view.lighting, view.actors, seed=noise_seed)
 
 
-def _unchanged(view: View, rng: np.random.Generator) -> View:
+def _unchanged(city: City, view: View, rng: np.random.Generator) -> View:
     return view
 
 
-def _for_training(view: View, rng: np.random.Generator) -> View:
+def _for_training(city: City, view: View, rng: np.random.Generator) -> View:
     cameras = tuple(_other_camera(camera, rng) for camera in view.cameras)
-    return replace(view, cameras=cameras, actors=_busier(view, rng))
+    return replace(view, cameras=cameras, actors=_busier(city, view, rng))
 
 
 def _other_camera(camera: Camera, rng: np.random.Generator) -> Camera:
@@ -85,7 +85,7 @@ def _other_camera(camera: Camera, rng: np.random.Generator) -> Camera:
     return replace(camera, intrinsics=intrinsics, world_from_camera=world_from_camera)
 
 
-def _busier(view: View, rng: np.random.Generator) -> tuple[Actor, ...]:
+def _busier(city: City, view: View, rng: np.random.Generator) -> tuple[Actor, ...]:
     """The traffic with a few cars made trucks, buses or cyclists, and people close by.
 
     Ordinary traffic shows too few of these for a training of minutes.
@@ -100,11 +100,13 @@ def _busier(view: View, rng: np.random.Generator) -> tuple[Actor, ...]:
     x, y = view.cameras[0].world_from_camera[:2, 3]
     for k in range(int(rng.integers(4, 16))):
         distance, bearing = 25 * np.sqrt(rng.uniform(0.03, 1)), rng.uniform(0, 2 * np.pi)  # 4 to 25 m
+        x_m, y_m = float(x + distance * np.cos(bearing)), float(y + distance * np.sin(bearing))
         actors.append(
             Actor(
                 kind=str(rng.choice(["pedestrian", "cyclist"], p=[0.8, 0.2])),
-                x_m=float(x + distance * np.cos(bearing)),
-                y_m=float(y + distance * np.sin(bearing)),
+                x_m=x_m,
+                y_m=y_m,
+                ground_m=float(city.surface_m(x_m, y_m)),
                 yaw_rad=float(rng.uniform(0, 2 * np.pi)),
                 colour=tuple(rng.uniform(0.03, 0.7, 3).tolist()),
                 instance=FIRST_ACTOR + EXTRA_INSTANCE + k,

@@ -1,6 +1,7 @@
 """City blocks: what stands between the streets."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,12 +9,12 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
-from presight_core.synthetic.buildings import FLOOR_M, Building, add_building
+from presight_core.synthetic.buildings import FLOOR_M, Building, BuildingKind, add_building, window_seeds
 from presight_core.synthetic.ground import CURB_M, Terrain
 from presight_core.synthetic.layers import polygons
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, MeshBuilder, Surface
-from presight_core.synthetic.style import BRICK, CityStyle
+from presight_core.synthetic.style import BRICK, GLASS, CityStyle, Colour
 
 LAWN = (0.17, 0.27, 0.08)
 PAVING = (0.46, 0.43, 0.39)
@@ -47,7 +48,7 @@ class Plots:
     depth: tuple[float, float]
 
 
-FLATS = Plots(set_back=1.0, gap=(0.0, 2.5), frontage=(11.0, 28.0), depth=(11.0, 17.0))
+FLATS = Plots(set_back=0.0, gap=(0.0, 2.5), frontage=(11.0, 28.0), depth=(11.0, 17.0))  # set back by the style
 HOUSES = Plots(set_back=5.5, gap=(3.0, 8.0), frontage=(9.0, 14.0), depth=(8.0, 11.0))
 
 
@@ -81,7 +82,8 @@ def _lay_ground(site: Site, block: Polygon, kind: str) -> None:
 def _line_with_buildings(site: Site, block: Polygon, kind: str) -> list[Polygon]:
     """Put buildings side by side along the edge of a block; returns their ground plans."""
     plots = FLATS if kind == "flats" else HOUSES
-    line = block.buffer(-plots.set_back, join_style="mitre")
+    set_back_m = site.style.set_back_m if kind == "flats" else plots.set_back
+    line = block.buffer(-set_back_m, join_style="mitre")
     built: list[Polygon] = []
     for part in polygons(line):
         corners = np.asarray(shapely.geometry.polygon.orient(part).exterior.simplify(0.6).coords)
@@ -113,29 +115,49 @@ def _plots_along(rng: np.random.Generator, plots: Plots, start: NDArray, end: ND
 
 def _build(site: Site, box: Box, kind: str) -> None:
     rng, style = site.rng, site.style
+    foot_m = site.terrain.lowest_m(box.vertices()[:4]) + 0.1
+    if kind == "houses":
+        height_m = 3.0 * int(rng.integers(1, 3)) + 0.4
+        _add_block(site, box._replace(z=foot_m, height=height_m), "house", has_shop=False)
+    elif rng.random() < style.tower_share:
+        base = box._replace(z=foot_m, height=2 * FLOOR_M)
+        number = _add_block(site, base, "flats", has_shop=True)
+        floors = int(rng.integers(style.tower_floors[0], style.tower_floors[1] + 1))
+        shaft = base._replace(z=foot_m + base.height, height=FLOOR_M * floors)
+        shaft = shaft._replace(length=0.85 * box.length, width=0.8 * box.width)
+        colour = _varied(rng, GLASS)
+        add_building(site.builder, rng, Building(shaft, colour, 4 * _window_seed(site), number, "distant"))
+    else:
+        floors = int(rng.integers(style.floors[0], style.floors[1] + 1))
+        _add_block(site, box._replace(z=foot_m, height=FLOOR_M * floors), "flats", has_shop=rng.random() < 0.6)
+
+
+def _add_block(site: Site, box: Box, kind: BuildingKind, has_shop: bool) -> int:
+    """One building in the colours of the city; returns its object number."""
+    rng, style = site.rng, site.style
     is_brick = rng.random() < style.brick_share
     palette = [wall for wall in style.walls if (wall in BRICK) == is_brick] or list(style.walls)
-    colour = np.clip(np.array(palette[int(rng.integers(len(palette)))]) + rng.normal(0, 0.03, 3), 0.06, 0.85)
-    if kind == "flats":
-        height, has_shop = FLOOR_M * int(rng.integers(style.floors[0], style.floors[1] + 1)), rng.random() < 0.6
-    else:
-        height, has_shop = 3.0 * int(rng.integers(1, 3)) + 0.4, False
-    foot_m = site.terrain.lowest_m(box.vertices()[:4]) + 0.1
-    pattern = 4 * int(rng.integers(0, 1000)) + 2 * is_brick + has_shop
-    building = Building(
-        box._replace(z=foot_m, height=float(height)),
-        (float(colour[0]), float(colour[1]), float(colour[2])),
-        int(pattern),
-        site.next_instance(),
-        "flats" if kind == "flats" else "house",
-    )
-    add_building(site.builder, rng, building)
+    pattern = 4 * _window_seed(site) + 2 * is_brick + has_shop
+    building = Building(box, _varied(rng, palette), int(pattern), site.next_instance(), kind)
+    add_building(site.builder, rng, building, style.tiles)
+    return building.instance
+
+
+def _varied(rng: np.random.Generator, palette: Sequence[Colour]) -> Colour:
+    colour = np.array(palette[int(rng.integers(len(palette)))]) + rng.normal(0, 0.03) + rng.normal(0, 0.01, 3)
+    red, green, blue = np.clip(colour, 0.06, 0.85).tolist()
+    return red, green, blue
+
+
+def _window_seed(site: Site) -> int:
+    seeds = window_seeds(*site.style.windows)
+    return seeds[int(site.rng.integers(len(seeds)))]
 
 
 def _border_gardens(site: Site, block: Polygon) -> None:
-    """A fence or a low wall around a block of houses, with gaps for paths."""
+    """Hedges, fences or low walls around a block of houses, with gaps for paths."""
     rng = site.rng
-    border = block.buffer(-0.35, join_style="mitre")
+    border = block.buffer(-0.4, join_style="mitre")
     for part in polygons(border):
         corners = np.asarray(part.exterior.simplify(0.3).coords)
         for start, end in itertools.pairwise(corners):
@@ -152,6 +174,11 @@ def _border_gardens(site: Site, block: Polygon) -> None:
 
 def _add_panel(site: Site, box: Box) -> None:
     rng, instance = site.rng, site.next_instance()
+    if rng.random() < site.style.hedge_share:
+        leaf = np.array(site.style.foliage) * rng.uniform(0.6, 0.9)
+        hedge = box._replace(width=0.6, height=float(rng.uniform(0.9, 1.6)), taper=0.92)
+        site.builder.add(hedge.vertices(), BOX_FACES[2:], Surface(Material.FOLIAGE, leaf, instance))
+        return
     if rng.random() < 0.45:
         stone = tuple(rng.uniform(0.8, 1.1) * np.array([0.42, 0.38, 0.33]))
         wall = box._replace(width=0.28, height=float(rng.uniform(0.7, 1.2)))

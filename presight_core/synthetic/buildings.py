@@ -1,14 +1,20 @@
 """Buildings: flats with shops, balconies and roof units; houses with gables; a skyline far away."""
 
 from dataclasses import dataclass
+from functools import cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, BOX_SIDES, BOX_TOP, Box, MeshBuilder, Surface, Wall
+from presight_core.synthetic.noise import hash01
+from presight_core.synthetic.style import TILES, Colour
 
 FLOOR_M = 3.3  # storey height
+
+BuildingKind = Literal["flats", "house", "distant"]
 
 
 @dataclass(frozen=True)
@@ -19,15 +25,25 @@ class Building:
     colour: tuple[float, float, float]
     pattern: int  # of its walls, see Wall
     instance: int
-    kind: str = "flats"  # or "house", "distant"
+    kind: BuildingKind = "flats"
 
 
-def add_building(builder: MeshBuilder, rng: np.random.Generator, building: Building) -> None:
-    """Append one building."""
+@cache
+def window_seeds(low: float, high: float) -> tuple[int, ...]:
+    """Texture seeds whose windows take such a share of their bay, from 0 (narrow) to 1 (nearly all)."""
+    return tuple(seed for seed in range(1000) if low <= hash01(seed, 2, 26) <= high)  # as the facade texture draws it
+
+
+def add_building(
+    builder: MeshBuilder, rng: np.random.Generator, building: Building, tiles: tuple[Colour, ...] = TILES
+) -> None:
+    """Append one building; houses take their roofs' colour from `tiles`."""
     vertices = building.box.vertices()
     _add_walls(builder, building, vertices)
     if building.kind == "house":
-        _add_gable_roof(builder, rng, building, vertices)
+        _add_gable_roof(
+            builder, building, vertices, np.array(tiles[int(rng.integers(len(tiles)))]) * rng.uniform(0.7, 1.1)
+        )
         return
     roof = Surface(Material.ROOF, tuple(np.full(3, rng.uniform(0.2, 0.45))), building.instance)
     builder.add(vertices, BOX_TOP, roof)
@@ -51,7 +67,7 @@ def _add_walls(builder: MeshBuilder, building: Building, vertices: NDArray[np.fl
 
 
 def _add_gable_roof(
-    builder: MeshBuilder, rng: np.random.Generator, building: Building, vertices: NDArray[np.float64]
+    builder: MeshBuilder, building: Building, vertices: NDArray[np.float64], tile: NDArray[np.float64]
 ) -> None:
     """A ridge along the street, eaves that stand out by 40 cm, gable walls below."""
     box, eaves_m = building.box, 0.4
@@ -65,9 +81,7 @@ def _add_gable_roof(
     across = (corners[3] - corners[0]) / box.width * eaves_m
     low = corners + np.stack([-along - across, along - across, along + across, across - along]) - down
     high = ridge + np.stack([-along, along])
-    shade = rng.uniform(0.7, 1.1)
-    tiles = [(0.30, 0.14, 0.10), (0.16, 0.16, 0.18), (0.26, 0.19, 0.14)][int(rng.integers(3))]
-    roof = Surface(Material.ROOF, tuple(np.array(tiles) * shade), building.instance)
+    roof = Surface(Material.ROOF, tile, building.instance)
     lift = np.array([0, 0, 0.05])  # above the gable walls
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5]]
     builder.add(np.r_[low, high] + lift, faces, roof)

@@ -63,7 +63,7 @@ class City:
 def _lay_surfaces(site: Site, layers: StreetLayers) -> None:
     builder, terrain, size_m = site.builder, site.terrain, site.style.size_m
     terrain.drape(builder, layers.drivable, Surface(Material.ASPHALT, site.style.asphalt), 0.0)
-    terrain.drape(builder, layers.walkway, Surface(Material.PAVING, (0.42, 0.40, 0.38)), CURB_M)
+    terrain.drape(builder, layers.walkway, Surface(Material.PAVING, site.style.paving), CURB_M)
     paint_m = 0.012  # above the asphalt; the waves cannot swallow it
     terrain.drape(builder, layers.white_paint, Surface(Material.WHITE_PAINT, (0.72, 0.72, 0.70)), paint_m)
     terrain.drape(builder, layers.yellow_paint, Surface(Material.YELLOW_PAINT, (0.74, 0.50, 0.08)), paint_m)

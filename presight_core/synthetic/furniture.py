@@ -8,7 +8,15 @@ from presight_core.synthetic.graph import CROSSING_DEPTH_M, STOP_LINE_GAP_M, Cro
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, Surface, cylinder
 
-STEEL = (0.30, 0.31, 0.32)
+SIGN_OUTLINES = {  # corners (N, 2) in metres across and up, counter-clockwise as seen from the front
+    "square": np.array([[-0.35, 0], [0.35, 0], [0.35, 0.7], [-0.35, 0.7]]),
+    "tall": np.array([[-0.3, 0], [0.3, 0], [0.3, 0.9], [-0.3, 0.9]]),
+    "wide": np.array([[-0.6, 0], [0.6, 0], [0.6, 0.55], [-0.6, 0.55]]),
+    "diamond": np.array([[0, 0], [0.5, 0.5], [0, 1.0], [-0.5, 0.5]]),
+    "triangle": np.array([[-0.45, 0], [0.45, 0], [0, 0.8]]),
+    "round": 0.36 * np.array([[np.sin(t), 1 - np.cos(t)] for t in np.arange(12) * np.pi / 6]),
+}
+LAMP_STEP_M = {"arm": 28.0, "double": 34.0, "lantern": 20.0}
 SIGN_COLOURS = ((0.62, 0.06, 0.06), (0.05, 0.15, 0.55), (0.80, 0.62, 0.08), (0.05, 0.33, 0.14), (0.75, 0.75, 0.75))
 
 
@@ -33,7 +41,9 @@ def _furnish(site: Site, graph: StreetGraph, edge: Edge) -> None:
         for along_m in free(np.arange(first + rng.uniform(0, 8), last, 12.0)):
             if is_leafy and rng.random() < 0.85:
                 site.trees.append(street.at(along_m, side * (curb_m + 1.0)))
-        for along_m in free(np.arange(first + (5 if side > 0 else 18), last, 28.0)):  # lamps stand staggered
+        for along_m in free(
+            np.arange(first + (5 if side > 0 else 18), last, LAMP_STEP_M[site.style.lamp])
+        ):  # staggered
             _add_lamp(site, street.at(along_m, side * (curb_m + 0.5)), -side * street.left_at(along_m))
         for along_m in free(rng.uniform(first, max(last, first + 1), 3)):
             facing = -side * graph.drive_side * street.tangent_at(along_m)
@@ -72,23 +82,44 @@ def _yaw(direction: NDArray[np.float64]) -> float:
 
 
 def _add_lamp(site: Site, foot: NDArray[np.float64], inward: NDArray[np.float64]) -> None:
-    steel = Surface(Material.POLE, STEEL, site.next_instance())
-    ground_m = _add_post(site, foot, (0.09, 7.5), steel)
-    yaw_rad = _yaw(inward)
-    _add_box(site, foot + inward * 1.2, ground_m + 7.4, (2.5, 0.12, 0.1), yaw_rad, steel)
-    head = foot + inward * 2.3
-    glass = Surface(Material.LAMP, (0.75, 0.75, 0.70), steel.instance)
-    _add_box(site, head, ground_m + 7.26, (0.8, 0.34, 0.14), yaw_rad, glass)
-    site.lamps.append(np.array([*head, ground_m + 7.2]))
+    kind = site.style.lamp
+    steel = Surface(Material.POLE, site.style.lamp_colour, site.next_instance())
+    if kind == "lantern":
+        ground_m = _add_post(site, foot, (0.07, 4.3), steel)
+        _add_lamp_head(site, foot, ground_m + 4.3, ((0.36, 0.36, 0.5), _yaw(inward)), steel.instance)
+        _add_box(site, foot, ground_m + 4.8, (0.5, 0.5, 0.08), _yaw(inward), steel)
+        return
+    height_m = 7.5 if kind == "arm" else 9.0
+    ground_m = _add_post(site, foot, (0.09, height_m), steel)
+    for arm in (inward,) if kind == "arm" else (inward, -0.7 * inward):  # the shorter one is over the sidewalk
+        _add_box(site, foot + arm * 1.2, ground_m + height_m - 0.1, (2.5 * np.hypot(*arm), 0.12, 0.1), _yaw(arm), steel)
+        head_size = (0.8, 0.34, 0.14), _yaw(arm)
+        _add_lamp_head(site, foot + arm * 2.3, ground_m + height_m - 0.24, head_size, steel.instance)
+
+
+def _add_lamp_head(
+    site: Site, centre: NDArray[np.float64], foot_m: float, size: tuple[tuple, float], instance: int
+) -> None:
+    """A glowing box of a size and yaw, noted as a lamp."""
+    _add_box(site, centre, foot_m, *size, Surface(Material.LAMP, (0.75, 0.75, 0.70), instance))
+    site.lamps.append(np.array([*centre, foot_m - 0.06]))
 
 
 def _add_sign(site: Site, foot: NDArray[np.float64], facing: NDArray[np.float64]) -> None:
     rng, instance = site.rng, site.next_instance()
-    ground_m = _add_post(site, foot, (0.045, 2.8), Surface(Material.POLE, (0.45, 0.45, 0.46), instance))
-    colour = SIGN_COLOURS[int(rng.integers(len(SIGN_COLOURS)))]
-    width, height = ((0.7, 0.7), (0.6, 0.9), (1.1, 0.6))[int(rng.integers(3))]
-    plate = Surface(Material.SIGN, colour, instance)
-    _add_box(site, foot + facing * 0.07, ground_m + 2.0, (0.04, width, height), _yaw(facing), plate)
+    shape = SIGN_OUTLINES[site.style.signs[int(rng.integers(len(site.style.signs)))]]
+    ground_m = _add_post(site, foot, (0.045, 2.6), Surface(Material.POLE, (0.45, 0.45, 0.46), instance))
+    plate = Surface(Material.SIGN, SIGN_COLOURS[int(rng.integers(len(SIGN_COLOURS)))], instance)
+    across = np.array([-facing[1], facing[0]])  # to the right of who looks at it
+    count = len(shape)
+    flat = foot + shape[:, :1] * across
+    sides = [np.c_[flat + facing * out, ground_m + 2.1 + shape[:, 1]] for out in (0.06, 0.09)]
+    i = np.arange(count)
+    j, fan = (i + 1) % count, np.arange(1, count - 1)
+    front = np.c_[np.zeros_like(fan), fan, fan + 1] + count
+    back = front[:, ::-1] - count
+    rim = np.r_[np.c_[i, j, j + count], np.c_[i, j + count, i + count]]
+    site.builder.add(np.concatenate(sides), np.r_[front, back, rim], plate)
 
 
 def _add_traffic_light(

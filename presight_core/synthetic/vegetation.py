@@ -19,14 +19,15 @@ def plant_trees(site: Site) -> None:
     for spot in site.trees:
         instance = site.next_instance()
         foot_m = float(site.terrain.height_m(*spot)) + 0.1
-        trunk_m, radius_m = rng.uniform(1.9, 3.0), rng.uniform(1.4, 2.5)
+        radius_m = rng.uniform(*site.style.tree_radius_m)
+        trunk_m = rng.uniform(1.9, 3.0) * max(1.0, radius_m / 2.2)  # wide crowns hang over the bays: room for vans
         bark = Surface(Material.TRUNK, (0.22, 0.16, 0.11), instance)
         trunk = trunk_vertices * [0.07 * radius_m, 0.07 * radius_m, trunk_m + 0.8 * radius_m] + [*spot, foot_m]
         site.builder.add(trunk, trunk_faces, bark)
         vertices, faces = crowns[int(rng.integers(CROWN_COUNT))]
         turn = rng.uniform(0, 2 * np.pi)
         c, s = np.cos(turn), np.sin(turn)
-        turned = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, rng.uniform(0.9, 1.4)]])
+        turned = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, rng.uniform(*site.style.tree_stretch)]])
         leaf = np.array(site.style.foliage) * rng.uniform(0.7, 1.25) + rng.uniform(-0.02, 0.03, 3)
         surface = Surface(Material.FOLIAGE, tuple(np.clip(leaf, 0.02, 0.4)), instance)
         crown = turned * radius_m

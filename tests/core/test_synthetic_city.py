@@ -14,12 +14,13 @@ from shapely.ops import unary_union
 from presight_core.classes import CITYSCAPES
 from presight_core.frames import is_rigid
 from presight_core.synthetic.actors import KINDS, Actor, actor_mesh, foot_of
+from presight_core.synthetic.buildings import window_seeds
 from presight_core.synthetic.city import City
 from presight_core.synthetic.graph import ROUTE_STEP_M, follow
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import Mesh
 from presight_core.synthetic.street import RADIUS_M
-from presight_core.synthetic.style import CityStyle
+from presight_core.synthetic.style import GARDENS, HARBOUR, TOWERS, CityStyle
 from presight_core.synthetic.traffic import Traffic, plan_traffic
 
 SMALL = CityStyle(size_m=200.0, spacing_m=90.0)
@@ -313,3 +314,33 @@ def _box(kind: str, poses: NDArray[np.float64]) -> NDArray[np.object_]:
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     turned = corners @ np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
     return np.asarray(shapely.polygons(turned + poses[:, None, :2]))
+
+
+# ---- styles ------------------------------------------------------------------------------------------------------
+
+
+def test_named_styles_give_cities_that_differ_beyond_their_plan():
+    tallest, green, paint = {}, {}, {}
+    for name, style in {"harbour": HARBOUR, "gardens": GARDENS, "towers": TOWERS}.items():
+        city = City(seed=1, style=replace(style, size_m=200.0, spacing_m=90.0))
+        x, y = city.mesh.vertices[:, :2].T
+        inside = (x > 0) & (x < 200) & (y > 0) & (y < 200)  # without the skyline
+        tallest[name] = city.mesh.vertices[inside, 2].max()
+        green[name] = (city.mesh.labels == CITYSCAPES.index("vegetation")).sum()
+        paint[name] = bool(city.layers.yellow_paint)
+    assert tallest["towers"] > 1.5 * tallest["harbour"] > 1.5 * tallest["gardens"]
+    assert green["gardens"] > 1.3 * max(green["harbour"], green["towers"])
+    assert paint == {"harbour": True, "gardens": False, "towers": False}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_styles_build(seed: int):
+    style = CityStyle.random(np.random.default_rng(seed), size_m=200.0)
+    assert len(City(seed, style).mesh.faces) > 10_000
+
+
+def test_window_seeds_widen_with_the_share():
+    narrow, wide = window_seeds(0.0, 0.3), window_seeds(0.7, 1.0)
+    assert narrow
+    assert wide
+    assert not set(narrow) & set(wide)
