@@ -100,7 +100,7 @@ def rigs_per_s(city: City, sizes: list[int], rounds: int) -> dict[str, float]:
 
 
 def seconds_a_rig(city: City, case: Case, seed: int) -> tuple[float, float]:
-    """Wall and processor time of one rig, its images shared among the threads; shadows of the city are made once a drive."""
+    """Wall and processor time of one rig, its images shared among the threads; city shadows are made once a drive."""
     renderer = Renderer(city, case.antialias)
     view = random_view(city, np.random.default_rng(seed), case.width_px, case.light)
     shadows = renderer.cast_shadows(view.lighting, view.cameras[0].world_from_camera[:3, 3])
