@@ -4,13 +4,16 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from presight_core.synthetic.jit import kernel
+from presight_core.synthetic.jit import shader
 from presight_core.synthetic.lighting import Lighting
 from presight_core.synthetic.noise import hash01
 
 # Glow around lamps: radius in image widths, share of the light over the white point that goes there.
 NARROW, WIDE = (0.004, 0.30), (0.03, 0.10)
 WIDE_STEP = 4  # wide glow is blurred on an image this many times smaller
+
+# The 2.2 display curve over the square root of the film's response: even steps, and cheaper than powers.
+_DISPLAY = np.round(np.linspace(0, 1, 2048) ** (2 / 2.2) * 255).astype(np.uint8)
 
 
 def develop(exposure: NDArray[np.float32], lighting: Lighting, seed: int) -> NDArray[np.uint8]:
@@ -20,7 +23,7 @@ def develop(exposure: NDArray[np.float32], lighting: Lighting, seed: int) -> NDA
     if lighting.blur > 0:
         exposure = _blurred(exposure, lighting.blur * exposure.shape[1])
     rgb = np.empty(exposure.shape, np.uint8)
-    _expose(exposure, lighting.shot_noise, lighting.read_noise, seed, rgb)
+    _expose(exposure, lighting.shot_noise, lighting.read_noise, seed, _DISPLAY, rgb)
     return rgb
 
 
@@ -37,13 +40,13 @@ def _blurred(image: ArrayLike, sigma_px: float) -> NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(np.asarray(image), (0, 0), sigma_px), np.float32)
 
 
-@kernel
-def _expose(exposure, shot_noise: float, read_noise: float, seed: int, rgb):
-    """Linear in the shadows, no hard clipping in the lights, then the 2.2 display curve.
+@shader
+def _expose(exposure, shot_noise: float, read_noise: float, seed: int, display, rgb):
+    """Film: linear in the shadows, no hard clipping in the lights, then the 2.2 display curve.
 
     Shot noise varies from pixel to pixel; read noise comes in blotches of two pixels, as demosaicing leaves it.
     """
-    height, width = rgb.shape[0], rgb.shape[1]
+    height, width, last = rgb.shape[0], rgb.shape[1], len(display) - 1
     for row in range(height):
         for column in range(width):
             off_x, off_y = (column - width / 2) / width, (row - height / 2) / width
@@ -53,4 +56,4 @@ def _expose(exposure, shot_noise: float, read_noise: float, seed: int, rgb):
                 shot = hash01(3 * column + channel, row, seed) - 0.5
                 read = hash01(3 * (column // 2) + channel, row // 2, seed + 1) - 0.5
                 film += 3.46 * (shot * np.sqrt(shot_noise * film) + read * read_noise)  # 3.46: uniform to one sigma
-                rgb[row, column, channel] = np.uint8(min(max(film, 0.0), 1.0) ** 0.4545 * 255 + 0.5)
+                rgb[row, column, channel] = display[int(np.sqrt(min(max(film, 0.0), 1.0)) * last + 0.5)]

@@ -31,7 +31,7 @@ _HEAD_LIGHT, _TAIL_LIGHT = int(Material.HEAD_LIGHT), int(Material.TAIL_LIGHT)
 _TRAFFIC_LIGHT = int(Material.TRAFFIC_LIGHT)
 
 LAMP_LIGHT = 0.75  # straight below a street lamp
-BEAM_LIGHT = 0.70  # of head lights on a wall at 7 m
+BEAM_LIGHT = 1.00  # of head lights on a wall at 7 m
 
 
 class Scene(NamedTuple):

@@ -38,8 +38,9 @@ def line_strength(distance_m, half_width_m, footprint_m):
 @inner
 def asphalt(x, y, footprint):
     """Brightness of road surface: grain, wear, repairs, sealed cracks, manholes."""
-    k = 1 + 0.35 * band(x, y, 7.0, footprint, 1) + 0.45 * band(x, y, 1.3, footprint, 2)
-    k += 0.5 * band(x, y, 0.35, footprint, 3) + 0.35 * band(x, y, 0.09, footprint, 4)
+    k = 1 + 0.30 * band(x, y, 7.0, footprint, 1) + 0.35 * band(x, y, 1.3, footprint, 2)
+    k += 0.40 * band(x, y, 0.35, footprint, 3) + 0.55 * band(x, y, 0.10, footprint, 4)
+    k += 0.60 * band(x, y, 0.03, footprint, 48)  # the stones
     u, v = (0.8 * x + 0.6 * y) / 7.0, (0.8 * y - 0.6 * x) / 5.0  # repairs: rectangles in cells of 7 x 5 m
     column, row = int(np.floor(u)), int(np.floor(v))
     kind = hash01(column, row, 5)

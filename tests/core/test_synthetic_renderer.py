@@ -5,14 +5,17 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from presight_core.cameras import Camera
 from presight_core.classes import CITYSCAPES, SKY
 from presight_core.frames import planar_transform
 from presight_core.synthetic.actors import FIRST_ACTOR, Actor
 from presight_core.synthetic.city import City
 from presight_core.synthetic.graph import follow
+from presight_core.synthetic.lamps import Lamps, driving, lamp_grid, street_light
 from presight_core.synthetic.lighting import KINDS, sample_lighting
 from presight_core.synthetic.renderer import Renderer, Views
 from presight_core.synthetic.rig import RIG, rig_cameras
+from presight_core.synthetic.sensor import develop
 from presight_core.synthetic.style import CityStyle
 from presight_core.synthetic.views import View, random_view
 
@@ -32,6 +35,24 @@ def view(city: City) -> View:
 @pytest.fixture(scope="module")
 def views(city: City, view: View) -> Views:
     return Renderer(city).render(view.cameras, view.lighting, view.actors)
+
+
+def ego_of(view: View) -> np.ndarray:
+    """world_from_ego of a view's rig."""
+    return view.cameras[0].world_from_camera @ np.linalg.inv(RIG[0].ego_from_camera)
+
+
+def look_down(position: np.ndarray, focal_px: float) -> Camera:
+    """A camera that looks straight down."""
+    world_from_camera = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    world_from_camera[:3, 3] = position
+    intrinsics = np.array([[focal_px, 0, 48], [0, focal_px, 28], [0, 0, 1]])
+    return Camera(intrinsics, world_from_camera, 96, 56)
+
+
+def light_at(lamps: Lamps, point: tuple[float, float, float], normal: tuple[float, float, float]) -> float:
+    """Street light on one surface point."""
+    return float(street_light.py_func(lamps, *point, *normal))
 
 
 def nearest_hits(triangles: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -110,6 +131,101 @@ def test_asphalt_carries_texture(city: City, view: View):
     near_road = (views.labels == CITYSCAPES.index("road")) & (views.depth_m < 12)
     grey = views.rgb.mean(-1)[near_road]
     assert grey.std() > 6  # grey levels; sensor noise alone gives 3
+
+
+def test_without_antialiasing_the_truth_is_the_same(city: City, view: View, views: Views):
+    plain = Renderer(city, antialias=False).render(view.cameras, view.lighting, view.actors)
+    assert plain.rgb.shape == views.rgb.shape
+    assert (plain.labels == views.labels).mean() > 0.999  # samples on an edge may fall to either side
+    same = plain.instances == views.instances
+    close = np.isclose(plain.depth_m, views.depth_m, rtol=1e-4)
+    assert close[same].mean() > 0.999
+
+
+def test_antialiasing_smooths_edges_and_keeps_the_brightness(city: City, view: View, views: Views):
+    plain = Renderer(city, antialias=False).render(view.cameras, view.lighting, view.actors).rgb.astype(float)
+    smooth = views.rgb.astype(float)
+    assert np.abs(np.diff(smooth, axis=2)).mean() < 0.9 * np.abs(np.diff(plain, axis=2)).mean()
+    assert abs(smooth.mean() - plain.mean()) < 3  # grey levels
+
+
+def test_a_night_is_the_same_bytes_in_any_number_of_threads(city: City, view: View):
+    night, ego = sample_lighting("night", np.random.default_rng(0)), ego_of(view)
+    renderer = Renderer(city)
+    with ThreadPoolExecutor(3) as pool:
+        runs = list(pool.map(lambda _: renderer.render(view.cameras, night, view.actors, ego=ego), range(3)))
+    assert len({run.rgb.tobytes() for run in runs}) == 1
+
+
+def test_a_night_is_darker_and_noisier_than_a_day(city: City, view: View):
+    renderer = Renderer(city)
+    grain, brightness = {}, {}
+    for kind in ("day", "night"):
+        lighting = sample_lighting(kind, np.random.default_rng(0))
+        first, second = (renderer.render(view.cameras, lighting, seed=seed).rgb.astype(float) for seed in (0, 999))
+        grain[kind], brightness[kind] = (first - second).std(), first.mean()
+    assert brightness["night"] < 0.6 * brightness["day"]
+    assert grain["night"] > 3 * grain["day"]
+
+
+def test_the_road_is_brighter_under_a_lamp_than_between_lamps(city: City):
+    camera = look_down(np.array([*city.lamps[0, :2], 45.0]), 60.0)
+    night = sample_lighting("night", np.random.default_rng(0))
+    views = Renderer(city).render([camera], night)
+    rows, columns = np.nonzero(views.labels[0] == CITYSCAPES.index("road"))
+    origin, directions = camera.rays(np.stack([columns, rows], -1) + 0.5)
+    places = origin + directions * (45.0 / -directions[:, 2:])
+    to_lamp_m = np.linalg.norm(places[:, None, :2] - city.lamps[:, :2], axis=2).min(1)
+    grey = views.rgb[0, rows, columns].mean(-1)
+    assert grey[to_lamp_m < 3].mean() > 1.5 * grey[to_lamp_m > 8].mean()
+
+
+def test_head_lights_light_the_road_ahead(city: City, view: View):
+    night = sample_lighting("night", np.random.default_rng(0))
+    renderer = Renderer(city)
+    off = renderer.render(view.cameras[:1], night)
+    lit = renderer.render(view.cameras[:1], night, ego=ego_of(view))
+    road = (off.labels == CITYSCAPES.index("road")) & (off.depth_m > 4) & (off.depth_m < 15)
+    assert lit.rgb[road].mean() > 1.2 * off.rgb[road].mean()
+    np.testing.assert_array_equal(off.depth_m, lit.depth_m)
+
+
+def test_by_day_head_lights_change_nothing(city: City, view: View, views: Views):
+    lit = Renderer(city).render(view.cameras, view.lighting, view.actors, ego=ego_of(view))
+    np.testing.assert_array_equal(lit.rgb, views.rgb)
+
+
+def test_parked_cars_have_their_lights_off(city: City):
+    x, y, yaw = city.layers.parking[0]
+    parked = Actor("car", x + 0.2, y, yaw, (0.5, 0.5, 0.5), FIRST_ACTOR)
+    moving = Actor("car", x + 30.0, y + 30.0, yaw, (0.5, 0.5, 0.5), FIRST_ACTOR + 1)
+    walker = Actor("pedestrian", x + 30.0, y, yaw, (0.5, 0.5, 0.5), FIRST_ACTOR + 2)
+    assert driving([parked, moving, walker], [city.layers.parking[0]]) == [moving]
+
+
+def test_lamps_light_what_is_below_them_only():
+    lamps = lamp_grid(np.array([[0.0, 0.0, 7.2], [100.0, 0.0, 7.2]]))
+    up, down = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
+    below = light_at(lamps, (0.0, 0.0, 0.0), up)
+    assert below == pytest.approx(1, abs=0.05)
+    assert below > light_at(lamps, (10.0, 0.0, 0.0), up) > 0
+    assert light_at(lamps, (50.0, 0.0, 0.0), up) == 0
+    assert light_at(lamps, (0.0, 0.0, 9.0), down) == 0
+    assert light_at(lamps, (5000.0, 0.0, 0.0), up) == 0
+
+
+def test_a_city_without_lamps_has_dark_streets():
+    assert light_at(lamp_grid(np.zeros((0, 3))), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) == 0
+
+
+def test_bright_lights_glow_after_dark_only():
+    lamp = np.zeros((60, 100, 3), np.float32)
+    lamp[30, 50] = 50.0
+    quiet = {"read_noise": 0.0, "shot_noise": 0.0, "blur": 0.0}
+    rng = np.random.default_rng(0)
+    day, night = (sample_lighting(kind, rng)._replace(**quiet) for kind in ("day", "night"))
+    assert develop(lamp, day, 0)[30, 52].max() == 0
+    assert develop(lamp, night, 0)[30, 52].min() > 0
 
 
 def test_a_car_in_front_hides_the_city_and_casts_a_shadow(city: City):
