@@ -185,7 +185,7 @@ class PriorDataset(Dataset[PriorSample]):
             points = self.priors.points(self._places[index], self._ranges)
             self._cache.put(index, points)
         points_ego = (points.points_ego + settings.noise.draw(random)) @ augmentation.matrix.T
-        features = points.features / np.float32(255) if settings.with_features else None
+        features = points.features if settings.with_features else None
         voxels = voxelise(points_ego, features, points.weights, settings.grid)
         return voxels if settings.drop is None else settings.drop.apply(voxels, random)
 

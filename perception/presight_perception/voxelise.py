@@ -67,25 +67,34 @@ class VoxelTensors(NamedTuple):
     coordinates: Tensor  # (V, 3) int64 x, y, z
 
 
-def voxelise(points_ego: ArrayLike, features: ArrayLike | None, hits: ArrayLike, grid: VoxelGrid) -> Voxels:
-    """Voxels of points (N, 3) with features (N, C) of 0..1, or None for geometry alone, and hits (N,) above 0."""
+def voxelise(points_ego: ArrayLike, features: NDArray | None, hits: ArrayLike, grid: VoxelGrid) -> Voxels:
+    """Voxels of points (N, 3) with features (N, C), or None for geometry alone, and hits (N,) above 0.
+
+    Features are shares, 0..1, or the store's bytes, 0..255.
+    """
     points, weights = np.asarray(points_ego, np.float64).reshape(-1, 3), np.asarray(hits, np.float64).reshape(-1)
     low, high = np.array(grid.low_m), np.array(grid.high_m)
     cells = np.floor((points - low) / grid.voxel_m).astype(np.int64)
-    inside = np.all((cells >= 0) & (cells < grid.shape), -1)
-    numbers, voxel_of_point = np.unique(np.ravel_multi_index(tuple(cells[inside].T), grid.shape), return_inverse=True)
-    columns = [(points - low) / (high - low)] if features is None else [(points - low) / (high - low), features]
-    values = np.concatenate([np.asarray(column, np.float64) for column in columns], -1)[inside]
-    weights = weights[inside]
-    summed = _sums(weights[:, None], voxel_of_point, len(numbers))
-    means = _sums(values * weights[:, None], voxel_of_point, len(numbers)) / summed
-    coordinates = np.stack(np.unravel_index(numbers, grid.shape), -1)
-    return Voxels(np.concatenate([means, np.log(summed)], -1).astype(np.float32), coordinates.astype(np.int32))
+    inside = np.flatnonzero(np.all((cells >= 0) & (cells < grid.shape), -1))
+    _, y_count, z_count = grid.shape
+    numbers = cells[inside] @ np.array([y_count * z_count, z_count, 1])
+    order = np.argsort(numbers, kind="stable")  # a voxel's points next to each other
+    rows, numbers = inside[order], numbers[order]
+    starts = np.flatnonzero(np.diff(numbers, prepend=-1))
+    summed = _sums(weights[rows], starts)
+    share = weights[rows] / np.repeat(summed, np.diff(starts, append=len(rows)))  # of each point in its voxel
+    channels = np.empty((len(starts), 4 + (0 if features is None else features.shape[1])), np.float32)
+    channels[:, :3] = _sums((points[rows] - low) / (high - low) * share[:, None], starts)
+    if features is not None:  # most of the work: in float32, a voxel having few points
+        scale = 1 / 255 if features.dtype == np.uint8 else 1.0
+        channels[:, 3:-1] = _sums(features[rows] * (share * scale).astype(np.float32)[:, None], starts)
+    channels[:, -1] = np.log(summed)
+    return Voxels(channels, np.stack(np.unravel_index(numbers[starts], grid.shape), -1).astype(np.int32))
 
 
 def voxelise_tensors(points_ego: Tensor, features: Tensor | None, hits: Tensor, grid: VoxelGrid) -> VoxelTensors:
     """The same as `voxelise`, on the tensors' device."""
-    points, weights = points_ego.double(), hits.double().reshape(-1, 1)
+    points, weights = points_ego.double(), hits.double().reshape(-1)
     low, high, size = (points.new_tensor(values) for values in (grid.low_m, grid.high_m, grid.voxel_m))
     _, y_count, z_count = grid.shape
     cells = ((points - low) / size).floor().long()
@@ -93,12 +102,17 @@ def voxelise_tensors(points_ego: Tensor, features: Tensor | None, hits: Tensor, 
     cells, weights = cells[inside], weights[inside]
     numbers = (cells[:, 0] * y_count + cells[:, 1]) * z_count + cells[:, 2]
     numbers, voxel_of_point = numbers.unique(return_inverse=True)
-    values = [((points - low) / (high - low))[inside]] + ([] if features is None else [features[inside].double()])
-    weighted = torch.cat([torch.cat(values, -1) * weights, weights], -1)
-    sums = weighted.new_zeros(len(numbers), weighted.shape[1]).index_add_(0, voxel_of_point, weighted)
-    means, summed = sums[:, :-1] / sums[:, -1:], sums[:, -1:]
+    summed = weights.new_zeros(len(numbers)).index_add_(0, voxel_of_point, weights)
+    share = (weights / summed[voxel_of_point]).unsqueeze(-1)
+    columns = [((points - low) / (high - low))[inside] * share]
+    if features is not None:
+        scale = 1 / 255 if features.dtype == torch.uint8 else 1.0
+        columns.append(features[inside] * (share * scale).float())
+    means = [
+        column.new_zeros(len(numbers), column.shape[1]).index_add_(0, voxel_of_point, column) for column in columns
+    ]
     coordinates = torch.stack([numbers // (y_count * z_count), numbers // z_count % y_count, numbers % z_count], -1)
-    return VoxelTensors(torch.cat([means, summed.log()], -1).float(), coordinates)
+    return VoxelTensors(torch.cat([mean.float() for mean in means] + [summed.log().float()[:, None]], -1), coordinates)
 
 
 def inside_range(points_ego: ArrayLike, grid: VoxelGrid) -> NDArray[np.bool_]:
@@ -127,7 +141,11 @@ class VoxelDrop:
         return Voxels(voxels.features[kept], voxels.coordinates[kept])
 
 
-def _sums(values: NDArray[np.float64], group: NDArray[np.int64], group_count: int) -> NDArray[np.float64]:
-    """Sums (G, K) of the rows (N, K) of each group; no group is empty."""
-    order = np.argsort(group, kind="stable")
-    return np.add.reduceat(values[order], np.searchsorted(group[order], np.arange(group_count)))
+def _sums(values: NDArray, starts: NDArray[np.int64]) -> NDArray:
+    """Sums (V, ...) of consecutive rows, each group beginning at one of `starts`. For groups of few rows."""
+    counts = np.diff(starts, append=len(values))
+    sums = values[starts]
+    for rank in range(1, counts.max(initial=0)):
+        longer = np.flatnonzero(counts > rank)
+        sums[longer] += values[starts[longer] + rank]
+    return sums

@@ -78,7 +78,7 @@ def test_without_augmentation_the_window_is_the_grid():
 
 @pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_workers_draw_what_a_single_process_draws(town, start):
-    dataset = dataset_of(town, TRAINING)
+    dataset = dataset_of(town, replace(TRAINING, cache_bytes=0))  # so that workers read, after this process has
     alone = list(DataLoader(dataset, batch_size=2, collate_fn=collate))
     loader = DataLoader(
         dataset, batch_size=2, collate_fn=collate, num_workers=2, multiprocessing_context=start, persistent_workers=True

@@ -56,6 +56,16 @@ def test_torch_makes_the_same_voxels(with_features):
     np.testing.assert_allclose(found.features, plain.features, atol=1e-7)
 
 
+def test_bytes_are_shares_of_255():
+    points, features, hits = example()
+    stored = np.round(features * 255).astype(np.uint8)
+    expected = voxelise(points, stored / 255, hits, GRID)
+    np.testing.assert_allclose(voxelise(points, stored, hits, GRID).features, expected.features, atol=1e-6)
+    tensors = [torch.from_numpy(part) for part in (points, stored, hits)]
+    found = voxelise_tensors(tensors[0], tensors[1], tensors[2], GRID)
+    np.testing.assert_allclose(found.features, expected.features, atol=1e-6)
+
+
 def test_no_points_make_no_voxels():
     found = voxelise(np.zeros((0, 3)), np.zeros((0, 64)), np.zeros(0), GRID)
     assert found.features.shape == (0, 68)
