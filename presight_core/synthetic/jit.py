@@ -34,9 +34,13 @@ def typed(signature: str) -> Callable:
 
 
 def _drop_stale_kernels() -> None:
-    """Delete kernels older than any source here: numba looks at the file of the outermost function only."""
+    """Delete kernels older than any source they could come from: numba looks at the outermost function's file only."""
     folder = Path(__file__).parent
-    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
+    sources = [folder / "jit.py", folder / "materials.py"]  # materials: kernels hold their numbers
+    sources += [
+        source for source in folder.glob("*.py") if "synthetic.jit import" in source.read_text(encoding="utf-8")
+    ]
+    newest = max(source.stat().st_mtime for source in sources)
     for index in (folder / "__pycache__").glob("*.nbi"):
         with contextlib.suppress(OSError):  # gone already, or an installation we may not write to
             if index.stat().st_mtime < newest:

@@ -9,9 +9,7 @@ from pydantic import Field, model_validator
 from presight_core.config import Count, Settings, merge, parse_overrides, validate
 from presight_core.errors import SettingsError
 from presight_core.nuscenes_split import PRIOR_SCENES, TEST_SCENES, Role
-from presight_core.synthetic.style import CityStyle, Density
-
-HARBOUR, GARDENS, TOWERS = CityStyle(left_hand=False), CityStyle(dense_share=0.2), CityStyle(brick_share=0.1)
+from presight_core.synthetic.style import GARDENS, HARBOUR, TOWERS, CityStyle, Density
 
 Light = Literal["day", "overcast", "dusk", "night"]
 # The official devkit knows these four maps and no other.
