@@ -28,9 +28,13 @@ inner = numba.njit(**_BARE)
 spliced = numba.njit(inline="always", **_OPTIONS)
 
 
-def typed(signature: str) -> Callable:
-    """Like `inner`, compiled once for this signature; otherwise every literal argument makes another copy."""
-    return numba.njit(signature, cache=True, **_BARE)
+def typed(signature: str, python: bool = False) -> Callable:
+    """Like `inner`, compiled once for this signature; otherwise every literal argument makes another copy.
+
+    `python`: Python may call it too; without its wrapper that would be a crash.
+    """
+    options = _BARE | {"cache": True, "no_cpython_wrapper": not python}
+    return numba.njit(signature, **options)
 
 
 def _drop_stale_kernels() -> None:

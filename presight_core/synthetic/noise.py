@@ -5,7 +5,7 @@ import numpy as np
 from presight_core.synthetic.jit import typed
 
 
-@typed("float64(int64, int64, int64)")
+@typed("float64(int64, int64, int64)", python=True)
 def hash01(x: int, y: int, seed: int) -> float:
     """A number in [0, 1) that looks random, of two integers and a seed."""
     # Odd 32-bit constants with well spread bits (the primes of xxHash), then two xor-shift-multiply rounds.
