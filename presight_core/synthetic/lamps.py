@@ -35,14 +35,13 @@ def lamp_grid(heads: NDArray[np.float64]) -> Lamps:
         return Lamps(np.zeros((0, 3)), np.zeros(2), np.full((1, 1, NEAR_COUNT), -1, np.int32))
     low = heads[:, :2].min(0) - REACH_M
     counts = np.ceil((heads[:, :2].max(0) + REACH_M - low) / CELL_M).astype(int)
+    centres = low + (np.stack(np.indices(counts), -1) + 0.5) * CELL_M
     nearest = np.full((*counts, NEAR_COUNT), -1, np.int32)
-    for column in range(counts[0]):
-        for row in range(counts[1]):
-            centre = low + (np.array([column, row]) + 0.5) * CELL_M
-            distance_m = np.linalg.norm(heads[:, :2] - centre, axis=1)
-            found = np.argsort(distance_m, kind="stable")[:NEAR_COUNT]
-            found = found[distance_m[found] < REACH_M + 0.71 * CELL_M]  # 0.71: half a cell's diagonal
-            nearest[column, row, : len(found)] = found
+    distance_m = np.linalg.norm(centres[:, :, None] - heads[:, :2], axis=-1)
+    found = np.argsort(distance_m, axis=-1, kind="stable")[..., :NEAR_COUNT]
+    within_m = REACH_M + 0.71 * CELL_M  # 0.71: half a cell's diagonal
+    is_near = np.take_along_axis(distance_m, found, -1) < within_m
+    nearest[..., : found.shape[-1]] = np.where(is_near, found, -1)
     return Lamps(np.ascontiguousarray(heads), low, nearest)
 
 

@@ -105,9 +105,10 @@ def shade_point(scene, face, ray, depth, focal, position):
     red, green, blue, gloss, glow_r, glow_g, glow_b = surface(
         material, x, y, z, (nx, ny, nz), wall, colour, footprint, -facing, light
     )
-    if material == _FOLIAGE:  # leaves point anywhere
-        nx += 1.6 * (value_noise(4 * x + 7, 4 * z, 33) - 0.5)
-        ny += 1.6 * (value_noise(4 * y, 4 * z + 9, 34) - 0.5)
+    if material == _FOLIAGE:  # leaves point anywhere, more of them up
+        nx += 1.8 * (value_noise(6 * x + 7, 6 * z, 33) - 0.5)
+        ny += 1.8 * (value_noise(6 * y, 6 * z + 9, 34) - 0.5)
+        nz += 0.3
         norm = np.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx / norm, ny / norm, nz / norm
     sun, sky = received(scene, material, (x, y, z), (nx, ny, nz))
@@ -191,6 +192,8 @@ def received(scene, material, point, normal):
         sky *= 0.75 + 0.25 * min(max(z / 4, 0.0), 1.0)  # narrow streets are darker at the bottom
     to_sun = scene.lighting.to_sun
     sun = normal[0] * to_sun[0] + normal[1] * to_sun[1] + normal[2] * to_sun[2]
+    if material == _FOLIAGE and sun < 0:
+        sun *= -0.35  # leaves let light through
     if sun <= 0:
         return 0.0, sky
     sun *= 1 - occlusion(scene.shadows.sun, x, y, z, 0.15, 0.2)

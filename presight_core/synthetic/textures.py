@@ -139,7 +139,8 @@ def window(from_side_m, from_sill_m, u, v, bay, floor, lit_share):
     if fate > 0.6 and v > 0.35 + 0.4 * hash01(bay, floor, 31):  # blinds, drawn to some height
         return 0.42, 0.40, 0.36, 0.08, 0.4 * light, warmth
     t = hash01(bay, floor, 32)
-    return 0.04 + 0.06 * t, 0.05 + 0.06 * t, 0.06 + 0.07 * t, 0.40, light, warmth
+    gloss = 0.15 + 0.45 * hash01(bay, floor, 49)  # panes hang at angles, and mirror other parts of the sky
+    return 0.04 + 0.06 * t, 0.05 + 0.06 * t, 0.06 + 0.07 * t, gloss, light, warmth
 
 
 @inner
@@ -173,5 +174,7 @@ def brightness(material, x, y, z, normal, footprint):
         return (1 + 0.5 * band(along + x * 0.1, z, 0.35, footprint, 37)) * (1 + 0.3 * band(x, y, 2.5, footprint, 38))
     if material == _FOLIAGE:
         clumps = value_noise(x * 2.2 + z, y * 2.2 - 0.7 * z, 39)
-        return 0.50 + 0.7 * clumps + 0.8 * band(x + 0.6 * z, y - 0.8 * z, 0.16, footprint, 40) + 0.3 * normal[2]
+        leaves = 0.8 * band(x + 0.6 * z, y - 0.8 * z, 0.16, footprint, 40)
+        leaves += 1.1 * band(x - 0.7 * z, y + 0.5 * z, 0.07, footprint, 41)
+        return 0.50 + 0.7 * clumps + leaves + 0.3 * normal[2]
     return 1.0
