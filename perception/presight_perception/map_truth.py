@@ -142,7 +142,7 @@ class _Frame:
 
 
 class _Places:
-    """Geometries in the world, found by place. The tree is made in each process that asks."""
+    """Geometries in the world, found by place."""
 
     def __init__(self, geometries: Sequence[BaseGeometry]) -> None:
         self._tree = STRtree(geometries)

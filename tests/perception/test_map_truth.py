@@ -1,6 +1,7 @@
 """Ground truth from a made-up map: a crossroads with an island, two crossings and three dividers."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -170,6 +171,11 @@ def test_a_file_is_read_like_its_tables(tmp_path, city):
     assert {name: [line.tolist() for line in lines] for name, lines in found.items()} == {
         name: [line.tolist() for line in lines] for name, lines in expected.items()
     }
+
+
+def test_a_map_reaches_worker_processes(city):
+    sent = pickle.loads(pickle.dumps(city))  # noqa: S301
+    assert len(sent.lines(HERE, SETTINGS)["boundary"]) == 5
 
 
 def test_an_absent_map_is_named(tmp_path):
