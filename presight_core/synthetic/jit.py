@@ -33,7 +33,7 @@ def typed(signature: str, python: bool = False) -> Callable:
 
     `python`: Python may call it too; without its wrapper that would be a crash.
     """
-    options = _BARE | {"cache": True, "no_cpython_wrapper": not python}
+    options: dict[str, Any] = _BARE | {"cache": True, "no_cpython_wrapper": not python}
     return numba.njit(signature, **options)
 
 
