@@ -194,6 +194,11 @@ def test_even_a_single_block_has_crossings(city: City):
     assert len(city.layers.stop_lines) == 2 * len(city.layers.crossings)
 
 
+def test_sidewalks_keep_to_the_road(bent: City):
+    reach = bent.layers.road.buffer(bent.style.sidewalk_m + 0.1)
+    assert all(reach.contains(polygon) for polygon in bent.layers.walkway)
+
+
 def test_nothing_stands_on_the_road(bent: City):
     mesh = bent.mesh
     standing = (Material.TRUNK, Material.POLE, Material.SIGN, Material.FENCE, Material.GARDEN_WALL, Material.FACADE)
