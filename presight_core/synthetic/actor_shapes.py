@@ -35,7 +35,7 @@ KINDS = {
     "truck": ActorKind(7.6, 2.45, 3.25, "vehicle.truck", "truck"),
     "bus": ActorKind(11.6, 2.55, 3.3, "vehicle.bus.rigid", "bus"),
     "trailer": ActorKind(6.0, 2.3, 2.6, "vehicle.trailer", "truck"),
-    "digger": ActorKind(6.0, 2.2, 3.0, "vehicle.construction", "truck"),
+    "digger": ActorKind(6.0, 1.9, 3.0, "vehicle.construction", "truck"),
     "cyclist": ActorKind(1.75, 0.6, 1.75, "vehicle.bicycle", "bicycle", has_rider=True),
     "bicycle": ActorKind(1.75, 0.55, 1.03, "vehicle.bicycle", "bicycle"),
     "motorcyclist": ActorKind(2.1, 0.75, 1.7, "vehicle.motorcycle", "motorcycle", has_rider=True),
@@ -288,13 +288,13 @@ def _make_digger(template: _Template, kind: ActorKind) -> None:
     """A small excavator, its arm folded in front of it."""
     iron = (0.10, 0.10, 0.10)
     for side in (-1, 1):
-        template.add(_box(-1.2, side * 0.85, 0, (3.2, 0.5, 0.72)), Material.TYRE, kind.label, RUBBER)
+        template.add(_box(-1.2, side * 0.72, 0, (3.2, 0.45, 0.72)), Material.TYRE, kind.label, RUBBER)
     template.add(_box(-1.2, 0, 0.5, (1.6, 1.3, 0.45)), Material.TYRE, kind.label, iron)
-    template.add(_box(-1.35, 0, 0.92, (3.2, 2.15, 0.3)), Material.CAR_PAINT, kind.label, PAINT)
-    template.add(_box(-2.3, 0, 1.2, (1.3, 2.1, 0.85), 0.94), Material.CAR_PAINT, kind.label, PAINT)  # engine
-    template.add(_box(-0.7, 0.5, 1.2, (1.5, 1.0, 0.55)), Material.CAR_PAINT, kind.label, PAINT)
-    template.add(_box(-0.7, 0.5, 1.75, (1.45, 0.96, 0.8), 0.92), Material.CAR_GLASS, kind.label, GLASS)
-    template.add(_box(-0.7, 0.5, 2.55, (1.5, 1.0, 0.1), 0.9), Material.CAR_PAINT, kind.label, PAINT)
+    template.add(_box(-1.35, 0, 0.92, (3.2, 1.85, 0.3)), Material.CAR_PAINT, kind.label, PAINT)
+    template.add(_box(-2.3, 0, 1.2, (1.3, 1.8, 0.85), 0.94), Material.CAR_PAINT, kind.label, PAINT)  # engine
+    template.add(_box(-0.7, 0.42, 1.2, (1.5, 0.95, 0.55)), Material.CAR_PAINT, kind.label, PAINT)
+    template.add(_box(-0.7, 0.42, 1.75, (1.45, 0.91, 0.8), 0.92), Material.CAR_GLASS, kind.label, GLASS)
+    template.add(_box(-0.7, 0.42, 2.55, (1.5, 0.95, 0.1), 0.9), Material.CAR_PAINT, kind.label, PAINT)
     boom = [(-0.3, 1.1), (0.9, 2.9), (1.3, 3.0), (2.8, 2.3), (2.7, 2.05), (1.3, 2.6), (0.2, 1.1)]
     arm = [(2.5, 2.4), (2.85, 2.4), (2.75, 0.8), (2.55, 0.8)]
     for profile in (boom, arm):

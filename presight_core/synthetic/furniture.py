@@ -47,7 +47,7 @@ def _furnish(site: Site, graph: StreetGraph, edge: Edge) -> None:
             _add_lamp(site, street.at(along_m, side * (curb_m + 0.5)), -side * street.left_at(along_m))
         for along_m in free(rng.uniform(first, max(last, first + 1), 3)):
             facing = -side * graph.drive_side * street.tangent_at(along_m)
-            _add_sign(site, street.at(along_m, side * (curb_m + 0.45)), facing)
+            _add_sign(site, street.at(along_m, side * (curb_m + 0.7)), facing)
     for crossing in graph.crossings(a, b):
         _add_signals(site, graph, edge, crossing)
 

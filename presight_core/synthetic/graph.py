@@ -41,6 +41,7 @@ class StreetGraph:
             self.neighbours[a].append(b)
             self.neighbours[b].append(a)
         self._lanes = {edge: 2 if self._is_major(edge) else 1 for edge in self.edges}
+        self._mouths_m = [self._measure_mouth(node) for node in range(len(self.nodes))]
         self._streets = self._bend_streets(rng, style.bend_m)
         self._middle_crossings = self._cross_between_junctions(rng)
 
@@ -144,8 +145,16 @@ class StreetGraph:
 
     def mouth_m(self, node: int) -> float:
         """How far from a node's centre its streets begin: room for the corners, then crossings and stop lines."""
-        widest = max(self.half_width_m(node, other) for other in self.neighbours[node])
-        return widest + 4.5 if self.is_junction(node) else 7.0  # 4.5: corner radius; 7: an easy bend
+        return self._mouths_m[node]
+
+    def _measure_mouth(self, node: int) -> float:
+        others = self.neighbours[node]
+        widest = max(self.half_width_m(node, other) for other in others)
+        steps = self.nodes[others] - self.nodes[node]
+        bearings = np.sort(np.arctan2(steps[:, 1], steps[:, 0]))
+        sharpest = float(np.diff(bearings, append=bearings[0] + 2 * np.pi).min())
+        meet_m = widest / np.tan(min(sharpest, np.pi / 2) / 2)  # where the curbs of two streets meet
+        return meet_m + (4.5 if self.is_junction(node) else 1.5)  # 4.5: corner radius; 1.5: an easy bend
 
     def random_path(self, rng: np.random.Generator, start: int, nodes: int) -> list[int]:
         """A walk of `nodes` nodes that turns back only at dead ends."""

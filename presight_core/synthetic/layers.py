@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry import LineString, Polygon
+from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
@@ -64,10 +64,17 @@ def polygons(geometry: BaseGeometry) -> list[Polygon]:
 
 def lay_streets(graph: StreetGraph, style: CityStyle) -> StreetLayers:
     """All street layers of a graph on a square map."""
-    streets = [LineString(graph.street(*edge).points).buffer(graph.half_width_m(*edge)) for edge in graph.edges]
+    streets = [
+        LineString(graph.street(*edge).points).buffer(graph.half_width_m(*edge), cap_style="flat")
+        for edge in graph.edges
+    ]
+    for node, place in enumerate(graph.nodes):  # fills the notch between flat ends without a bulge beyond a T
+        streets.append(Point(place).buffer(min(graph.half_width_m(node, other) for other in graph.neighbours[node])))
     corner_m = 5.0  # curb radius at junctions
     road = unary_union(streets).buffer(corner_m, quad_segs=6).buffer(-corner_m, quad_segs=6).simplify(SNAP_M)
-    with_walkway = road.buffer(style.sidewalk_m, join_style="mitre")
+    with_walkway = road.buffer(style.sidewalk_m, quad_segs=4).simplify(
+        SNAP_M
+    )  # mitres would turn any notch into a spike
     layers = StreetLayers(
         road=road,
         drivable=polygons(road),

@@ -44,11 +44,12 @@ def things_on(works: Works, graph: StreetGraph, rng: np.random.Generator) -> lis
     for along_m in (start, end):
         put("barrier", along_m, (inner + outer) / 2 + 0.1)
     is_fenced = rng.random() < 0.4
-    for along_m in np.arange(start + 1.3, end - 1.2, 2.15 if is_fenced else 2.6):
-        put("barrier" if is_fenced else "cone", along_m, inner + 0.3, np.pi / 2 if is_fenced else 0.0)
+    step_m = 3.0 if is_fenced else 2.4  # boards of 2 m: on the inside of a bend they come closer
+    for along_m in np.arange(start + 1.5, end - 1.4, step_m):
+        put("barrier" if is_fenced else "cone", along_m, inner + 0.15, np.pi / 2 if is_fenced else 0.0)
     spots = [end - 1.4, start + 1.4]
     if inner == LANE_WIDTH_M and end - start > 11 and rng.random() < 0.7:  # only the parking lane is wide enough
-        put("digger", (start + end) / 2, outer - 1.0, np.pi * int(rng.integers(2)))
+        put("digger", (start + end) / 2, outer - 0.95, np.pi * int(rng.integers(2)))
         spots.pop()
     for spot in spots:
         put("worker", spot, rng.uniform(inner + 0.9, outer - 0.3), rng.uniform(0, 2 * np.pi))

@@ -17,6 +17,7 @@ from presight_core.synthetic.tracks import Colour, Crowd, Profile, Track, after_
 
 REACH_M = 130.0  # actors farther from the ego than this are not drawn
 NEAR_M = 70.0  # rare things are put this close to the ego's way, so that they are seen
+MEETING_M = 35.0  # who comes this close to the ego vehicle is well seen
 CHECK_S = 0.25  # how often two tracks are compared
 DRIVING_ROOM_M = (1.5, 0.4)  # between those who drive, lengthwise and sideways
 STANDING_ROOM_M = (0.15, 0.12)  # from and between those who stand
@@ -132,12 +133,14 @@ class _Planner:
     # ---- those who move ----
 
     def drive(self, kind: str, stopping: float) -> None:
-        """Send somebody on wheels on a random route; after a dozen clashes they stay at home."""
+        """Send somebody on wheels on a random route; after sixteen clashes they stay at home.
+
+        Riders are few, so most of them are sent where the ego vehicle meets them."""
         graph, rng = self.city.graph, self.rng
         reach_m = NEAR_M if KINDS[kind].has_rider else REACH_M
         starts = [node for node, place in enumerate(graph.nodes) if self._is_near(place, reach_m)]
         speeds = (3.0, 5.0) if kind == "cyclist" else (5.0, 9.0)
-        for _ in range(12):
+        for attempt in range(16):
             path = graph.straightest_path(rng, int(rng.choice(starts or len(graph.nodes))), 6)
             lane = 1 if kind == "cyclist" else int(rng.integers(2))
             route = graph.route(path, lane)
@@ -148,6 +151,9 @@ class _Planner:
                 continue
             track = Track(kind, self._paint(), self._next_instance(), route, profile)
             poses = track.poses(self.times)
+            is_far = np.linalg.norm(poses[:, :2] - self.ego[:, :2], axis=1).min() > MEETING_M
+            if KINDS[kind].has_rider and is_far and attempt < 10:
+                continue
             if self._is_free(kind, poses, DRIVING_ROOM_M):
                 self._add_moving(track, poses)
                 return
@@ -165,7 +171,7 @@ class _Planner:
         places_m = self._stops_on(route, path) - length_m / 2 - 0.5  # the front half a metre before the line
         if not len(places_m):
             return None
-        wait_s = rng.uniform(2, 6)
+        wait_s = rng.uniform(3, 9)
         arrival_s = rng.uniform(-0.8 * wait_s, max(0.8 * end_s, 0.1))
         profile = with_stop(speed_mps, float(rng.choice(places_m)), (arrival_s, arrival_s + wait_s), end_s)
         first_m, last_m = np.interp([0, end_s], *profile)

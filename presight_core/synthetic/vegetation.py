@@ -20,7 +20,7 @@ def plant_trees(site: Site) -> None:
         instance = site.next_instance()
         foot_m = float(site.terrain.height_m(*spot)) + 0.1
         radius_m = rng.uniform(*site.style.tree_radius_m)
-        trunk_m = rng.uniform(1.9, 3.0) * max(1.0, radius_m / 2.2)  # wide crowns hang over the bays: room for vans
+        trunk_m = rng.uniform(2.2, 3.1) * max(1.0, radius_m / 2.0)  # wide crowns hang over the bays: room for vans
         bark = Surface(Material.TRUNK, (0.22, 0.16, 0.11), instance)
         trunk = trunk_vertices * [0.07 * radius_m, 0.07 * radius_m, trunk_m + 0.8 * radius_m] + [*spot, foot_m]
         site.builder.add(trunk, trunk_faces, bark)

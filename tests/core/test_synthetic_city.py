@@ -194,6 +194,19 @@ def test_even_a_single_block_has_crossings(city: City):
     assert len(city.layers.stop_lines) == 2 * len(city.layers.crossings)
 
 
+def test_sidewalks_keep_to_the_road(bent: City):
+    reach = bent.layers.road.buffer(bent.style.sidewalk_m + 0.1)
+    assert all(reach.contains(polygon) for polygon in bent.layers.walkway)
+
+
+def test_nothing_stands_on_the_road(bent: City):
+    mesh = bent.mesh
+    standing = (Material.TRUNK, Material.POLE, Material.SIGN, Material.FENCE, Material.GARDEN_WALL, Material.FACADE)
+    places = mesh.vertices[np.unique(mesh.faces[np.isin(mesh.materials, standing)])]
+    low = places[:, 2] < 2.2  # arms of lamps and lights hang higher
+    assert not shapely.contains_xy(bent.layers.road.buffer(-0.05), *places[low, :2].T).any()
+
+
 # ---- ground ------------------------------------------------------------------------------------------------------
 
 
@@ -320,15 +333,16 @@ def _box(kind: str, poses: NDArray[np.float64]) -> NDArray[np.object_]:
 
 
 def test_named_styles_give_cities_that_differ_beyond_their_plan():
-    tallest, green, paint = {}, {}, {}
+    height, green, paint = {}, {}, {}
     for name, style in {"harbour": HARBOUR, "gardens": GARDENS, "towers": TOWERS}.items():
         city = City(seed=1, style=replace(style, size_m=200.0, spacing_m=90.0))
-        x, y = city.mesh.vertices[:, :2].T
-        inside = (x > 0) & (x < 200) & (y > 0) & (y < 200)  # without the skyline
-        tallest[name] = city.mesh.vertices[inside, 2].max()
+        walls = city.mesh.vertices[city.mesh.faces[city.mesh.materials == Material.FACADE]]
+        inside = (np.abs(walls[:, 0, :2] - 100) < 100).all(1)  # without the skyline
+        height[name] = walls[inside, :, 2].mean()
         green[name] = (city.mesh.labels == CITYSCAPES.index("vegetation")).sum()
         paint[name] = bool(city.layers.yellow_paint)
-    assert tallest["towers"] > 1.5 * tallest["harbour"] > 1.5 * tallest["gardens"]
+    assert height["towers"] > 1.5 * height["harbour"]
+    assert height["harbour"] > 1.5 * height["gardens"]
     assert green["gardens"] > 1.3 * max(green["harbour"], green["towers"])
     assert paint == {"harbour": True, "gardens": False, "towers": False}
 
