@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
 
 from presight_core.synthetic.actors import KINDS, Actor, foot_of
 from presight_core.synthetic.jit import inner
@@ -36,12 +37,9 @@ def lamp_grid(heads: NDArray[np.float64]) -> Lamps:
     low = heads[:, :2].min(0) - REACH_M
     counts = np.ceil((heads[:, :2].max(0) + REACH_M - low) / CELL_M).astype(int)
     centres = low + (np.stack(np.indices(counts), -1) + 0.5) * CELL_M
-    nearest = np.full((*counts, NEAR_COUNT), -1, np.int32)
-    distance_m = np.linalg.norm(centres[:, :, None] - heads[:, :2], axis=-1)
-    found = np.argsort(distance_m, axis=-1, kind="stable")[..., :NEAR_COUNT]
     within_m = REACH_M + 0.71 * CELL_M  # 0.71: half a cell's diagonal
-    is_near = np.take_along_axis(distance_m, found, -1) < within_m
-    nearest[..., : found.shape[-1]] = np.where(is_near, found, -1)
+    _, found = KDTree(heads[:, :2]).query(centres, NEAR_COUNT, distance_upper_bound=within_m)
+    nearest = np.where(found < len(heads), found, -1).astype(np.int32)
     return Lamps(np.ascontiguousarray(heads), low, nearest)
 
 
@@ -90,7 +88,7 @@ def street_light(lamps, x, y, z, nx, ny, nz):
         flat = dx * dx + dy * dy
         if dz <= 0 or flat > REACH_M * REACH_M:  # nothing goes up
             continue
-        squared = flat + dz * dz + 0.5  # 0.5: the pole's own arm would burn out
+        squared = flat + dz * dz + 4  # 4: leaves beside a lamp would burn out
         distance = np.sqrt(squared)
         facing = (nx * dx + ny * dy + nz * dz) / distance
         if facing <= 0:
@@ -98,7 +96,7 @@ def street_light(lamps, x, y, z, nx, ny, nz):
         down = dz / distance
         cone = min(max((down - 0.10) / 0.55, 0.0), 1.0)  # full within 50 degrees of straight down, none at 84
         edge = 1 - flat / (REACH_M * REACH_M)
-        total += 51.8 * facing * cone * cone * (3 - 2 * cone) * edge * edge / squared  # 51.8: the square of 7.2 m
+        total += 55.8 * facing * cone * cone * (3 - 2 * cone) * edge * edge / squared  # 55.8: 1 from 7.2 m
     return total
 
 
