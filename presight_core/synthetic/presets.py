@@ -1,7 +1,7 @@
 """How much of a data set to make: cities, drives, images and ground truth, as settings."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -118,7 +118,15 @@ def _scene_names(paper_split: bool) -> dict[Role, tuple[str, ...]]:
     }  # fmt: skip
 
 
-_TRAINING_LIGHTS: tuple[Light, ...] = ("day", "overcast", "dusk", "day", "night", "overcast", "day", "day") * 2
+# Twelve drives; each street is seen twice, in different light.
+_TRAINING_LIGHTS: tuple[Light, ...] = (
+    "day", "overcast", "dusk", "day", "night", "overcast", "overcast", "day", "day", "night", "day", "dusk",
+)  # fmt: skip
+
+
+def _large(style: CityStyle) -> CityStyle:
+    return replace(style, size_m=520.0)  # room for six streets of 150 m that hardly overlap
+
 
 PRESETS = {
     "ci": SynthPreset(
@@ -138,10 +146,14 @@ PRESETS = {
     "experiment": SynthPreset(
         name="experiment",
         towns={
-            "boston-seaport": Town(style=HARBOUR, streets=4, train=_TRAINING_LIGHTS[:12]),
-            "singapore-queenstown": Town(style=GARDENS, streets=4, train=_TRAINING_LIGHTS[:12]),
+            "boston-seaport": Town(
+                style=replace(HARBOUR, size_m=_EXPERIMENT_M), streets=4, train=_TRAINING_LIGHTS[:12]
+            ),
+            "singapore-queenstown": Town(
+                style=replace(GARDENS, size_m=_EXPERIMENT_M), streets=4, train=_TRAINING_LIGHTS[:12]
+            ),
             "singapore-onenorth": Town(
-                style=TOWERS,
+                style=_large(TOWERS),
                 streets=4,
                 new_streets=1,  # a fifth of what test drives see is new: the paper's overlap is 80 %
                 prior=("day", "overcast", "day", "overcast") * 2,  # night stays out of priors, as in the paper
