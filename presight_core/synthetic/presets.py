@@ -146,12 +146,8 @@ PRESETS = {
     "experiment": SynthPreset(
         name="experiment",
         towns={
-            "boston-seaport": Town(
-                style=replace(HARBOUR, size_m=_EXPERIMENT_M), streets=4, train=_TRAINING_LIGHTS[:12]
-            ),
-            "singapore-queenstown": Town(
-                style=replace(GARDENS, size_m=_EXPERIMENT_M), streets=4, train=_TRAINING_LIGHTS[:12]
-            ),
+            "boston-seaport": Town(style=_large(HARBOUR), streets=6, train=_TRAINING_LIGHTS),
+            "singapore-queenstown": Town(style=_large(GARDENS), streets=6, train=_TRAINING_LIGHTS),
             "singapore-onenorth": Town(
                 style=_large(TOWERS),
                 streets=4,
