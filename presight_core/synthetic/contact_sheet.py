@@ -22,7 +22,8 @@ from presight_core.synthetic.presets import DriveOrder, SynthPreset
 Rgb = NDArray[np.uint8]
 
 AROUND = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT")
-ROW_PX = 135  # height of a row: six cameras then fit a page of 1,450 pixels
+PAGE_PX = 1460  # width
+ROW_PX = 135  # height of a row: six cameras fit a page
 PLAN_PX = 290  # height of the bird's-eye pictures
 REACH_M = 40.0  # of the bird's-eye pictures
 ROLE_COLOURS = {"train": (40, 110, 220), "prior": (30, 150, 60), "test": (220, 60, 40)}
@@ -44,13 +45,13 @@ def draw_contact_sheet(root: Path, preset: SynthPreset) -> Path:
         if (order.location, order.light) not in shown:
             shown.add((order.location, order.light))
             images = [_Moment(root, preset, order).image(channel) for channel in AROUND]
-            rows.append(_titled(f"{order.scene}, {order.location}, {order.light}", images, ROW_PX))
+            rows.extend(_titled(f"{order.scene}, {order.location}, {order.light}", images, ROW_PX))
     first = _Moment(root, preset, preset.drives[0])
-    rows.append(_titled(f"{first.order.scene}, ground truth: depth, classes, objects", first.truth(), ROW_PX))
+    rows.extend(_titled(f"{first.order.scene}, ground truth: depth, classes, objects", first.truth(), ROW_PX))
     plans = [*first.from_above(), *(_map(root, preset, location) for location in preset.towns)]
     what = [name for name, is_there in (("lidar", preset.lidar), ("occupancy", preset.occupancy)) if is_there]
     title = ", ".join([*what, "the cities and their drives (train blue, prior green, test red)"])
-    rows.append(_titled(f"from above: {title}", plans, PLAN_PX))
+    rows.extend(_titled(f"from above: {title}", plans, PLAN_PX))
     file = root / "contact_sheet.png"
     save_png(file, stack_rows([[row] for row in rows]))
     return file
@@ -126,6 +127,5 @@ def _map(root: Path, preset: SynthPreset, location: str) -> Rgb:
     return cv2.resize(picture, (PLAN_PX, PLAN_PX), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
-def _titled(title: str, images: Sequence[Rgb], height_px: int) -> Rgb:
-    row = stack_rows([images], height_px=height_px)
-    return np.concatenate([title_strip(title, row.shape[1]), row])
+def _titled(title: str, images: Sequence[Rgb], height_px: int) -> list[Rgb]:
+    return [title_strip(title, PAGE_PX), stack_rows([images], height_px=height_px)]
