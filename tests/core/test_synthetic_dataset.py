@@ -215,10 +215,13 @@ def test_an_unknown_preset_is_refused_before_anything_is_written(tmp_path: Path)
 
 def test_sweeps_fill_the_time_between_keyframes(tmp_path: Path):
     one_drive = 'towns.singapore-onenorth.train=["day"]'
-    write_dataset(tmp_path, load_preset("ci", [*SMALL, "sweeps=true", one_drive, "keyframes=2"]), seed=5, threads=2)
+    preset = load_preset("ci", [*SMALL, "sweeps=true", "lidar=true", one_drive, "keyframes=2"])
+    write_dataset(tmp_path, preset, seed=5, threads=2)
     rows = json.loads((tmp_path / VERSION / "sample_data.json").read_text())
     samples = json.loads((tmp_path / VERSION / "sample.json").read_text())
-    assert Counter(row["is_key_frame"] for row in rows) == {True: 12, False: 30}
+    assert Counter(row["is_key_frame"] for row in rows) == {True: 14, False: 39}  # 12 and 30 images, 2 and 9 turns
+    turns = [row["timestamp"] for row in rows if "/LIDAR_TOP/" in row["filename"]]
+    assert set(np.diff(turns)) == {50_000}  # microseconds
     front = [row for row in rows if "/CAM_FRONT/" in row["filename"]]
     gaps = np.diff([row["timestamp"] for row in front])
     assert np.all(np.abs(gaps - 1e6 / 12) < 2)  # microseconds
