@@ -19,7 +19,6 @@ BEAM_REACH_M = 70.0
 BEAM_COUNT = 6  # other vehicles whose head lights light the street
 LIGHT_M = 0.65  # height of head lights
 EGO_FRONT_M = 3.7  # from the ego's origin, its rear axle, to the head lights
-PARKED_M = 1.0  # a vehicle this close to the middle of a parking bay is parked: lanes are 2.8 m away
 
 
 class Lamps(NamedTuple):
@@ -43,16 +42,10 @@ def lamp_grid(heads: NDArray[np.float64]) -> Lamps:
     return Lamps(np.ascontiguousarray(heads), low, nearest)
 
 
-def driving(actors: Sequence[Actor], parking: Sequence[tuple[float, float, float]]) -> list[Actor]:
-    """The vehicles with their lights on: those that stand in no parking bay (x, y, yaw)."""
+def driving(actors: Sequence[Actor]) -> list[Actor]:
+    """The vehicles with their lights on: those with an engine that are not parked."""
     vehicles = [actor for actor in actors if KINDS[actor.kind].category.startswith("vehicle")]
-    vehicles = [actor for actor in vehicles if actor.kind != "cyclist"]
-    if not vehicles or not parking:
-        return vehicles
-    bays = np.asarray(parking)[:, :2]
-    places = np.array([[actor.x_m, actor.y_m] for actor in vehicles])
-    to_bay_m = np.linalg.norm(places[:, None] - bays, axis=2).min(1)
-    return [actor for actor, distance_m in zip(vehicles, to_bay_m, strict=True) if distance_m > PARKED_M]
+    return [actor for actor in vehicles if actor.motion != "parked" and actor.kind != "cyclist"]
 
 
 def head_light_beams(vehicles: Sequence[Actor], ego: NDArray[np.float64] | None, centre: ArrayLike) -> NDArray:

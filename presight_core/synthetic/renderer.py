@@ -68,7 +68,7 @@ class Renderer:
         `seed` decides the sensor noise; `ego` is world_from_ego (4, 4) of the car whose head lights shine after dark.
         """
         centre = np.mean([camera.world_from_camera[:3, 3] for camera in cameras], axis=0)
-        vehicles = driving(actors, self.city.layers.parking) if lighting.lamps > 0 else []
+        vehicles = driving(actors) if lighting.lamps > 0 else []
         moving = _switch_on(actor_mesh(actors), vehicles)
         scene = Scene(
             self.city.mesh,

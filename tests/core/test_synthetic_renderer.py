@@ -195,12 +195,11 @@ def test_by_day_head_lights_change_nothing(city: City, view: View, views: Views)
     np.testing.assert_array_equal(lit.rgb, views.rgb)
 
 
-def test_parked_cars_have_their_lights_off(city: City):
-    x, y, yaw = city.layers.parking[0]
-    parked = Actor("car", x + 0.2, y, yaw, (0.5, 0.5, 0.5), FIRST_ACTOR)
-    moving = Actor("car", x + 30.0, y + 30.0, yaw, (0.5, 0.5, 0.5), FIRST_ACTOR + 1)
-    walker = Actor("pedestrian", x + 30.0, y, yaw, (0.5, 0.5, 0.5), FIRST_ACTOR + 2)
-    assert driving([parked, moving, walker], [city.layers.parking[0]]) == [moving]
+def test_parked_cars_have_their_lights_off():
+    parked = Actor("car", 0.0, 0.0, 0.0, (0.5, 0.5, 0.5), FIRST_ACTOR)
+    stopped = Actor("car", 30.0, 0.0, 0.0, (0.5, 0.5, 0.5), FIRST_ACTOR + 1, motion="stopped")
+    walker = Actor("pedestrian", 30.0, 9.0, 0.0, (0.5, 0.5, 0.5), FIRST_ACTOR + 2, motion="moving")
+    assert driving([parked, stopped, walker]) == [stopped]
 
 
 def test_lamps_light_what_is_below_them_only():
