@@ -129,7 +129,10 @@ def synth(
     out: Annotated[Path, typer.Argument(help="Folder of the new data set.", show_default=False)],
     preset: Annotated[str, typer.Option(help="ci, demo or experiment.")] = "demo",
     seed: Annotated[int, typer.Option(min=0, help="Seed: the same seed gives the same city.")] = 0,
-    override: Overrides = None,
+    override: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change the preset, for example keyframes=10 or lidar=true."),
+    ] = None,
 ) -> None:
     """Generate the embedded city: a procedural data set in nuScenes format with ground truth."""
     from flows.demo import generate_city

@@ -109,19 +109,19 @@ def shipped_models(kind: Kind) -> list[str]:
 
 
 def _card_path(name_or_path: str, kind: Kind) -> Path:
+    """A shipped model's name wins over a folder of that name that happens to lie here; `./name` means the folder."""
+    if name_or_path in shipped_models(kind):
+        return MODELS_FOLDER / name_or_path / f"{kind}.toml"
     path = Path(name_or_path)
     if path.is_dir():
         return path / f"{kind}.toml"
     if path.suffix == ".toml" or len(path.parts) > 1:
         return path
-    shipped = MODELS_FOLDER / name_or_path / f"{kind}.toml"
-    if not shipped.is_file():
-        names = ", ".join(shipped_models(kind)) or "none"
-        raise SettingsError(
-            f"{kind} model {name_or_path!r} does not come with PreSight (shipped: {names}); "
-            "name one of these, or give the path of a model card"
-        )
-    return shipped
+    names = ", ".join(shipped_models(kind)) or "none"
+    raise SettingsError(
+        f"{kind} model {name_or_path!r} does not come with PreSight (shipped: {names}); "
+        "name one of these, or give the path of a model card"
+    )
 
 
 def _refuse_other_folders(file: Any, card: Path) -> None:

@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from presight_core.errors import SettingsError
 from presight_core.progress import Progress, Report, silent
@@ -80,11 +80,19 @@ def _claim(root: Path, preset: SynthPreset, seed: int) -> None:
         return
     found = json.loads(stamp.read_text(encoding="utf-8"))
     if found != wanted:
-        made = f"preset {found.get('preset', {}).get('name')!r}, seed {found.get('seed')}, format {found.get('format')}"
         raise SettingsError(
-            f"{root} holds another synthetic data set ({made}; wanted preset {preset.name!r}, seed {seed}, "
-            f"format {FORMAT}, perhaps with other settings); choose another folder, or delete this one"
+            f"{root} holds another synthetic data set: {'; '.join(_differences(found, wanted))}; "
+            "choose another folder, or delete this one"
         )
+
+
+def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
+    """What differs between two nested settings, one line each: `name is this, wanted that`."""
+    if not (isinstance(found, dict) and isinstance(wanted, dict)):
+        return [] if found == wanted else [f"{name} is {found!r}, wanted {wanted!r}"]
+    prefix = f"{name}." if name else ""
+    keys = sorted({*found, *wanted})
+    return [line for key in keys for line in _differences(found.get(key), wanted.get(key), f"{prefix}{key}")]
 
 
 def _rows_file(root: Path, scene: str) -> Path:

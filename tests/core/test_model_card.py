@@ -113,3 +113,9 @@ def test_a_model_with_another_hash_is_refused(card_file):
     (card_file.parent / "model.onnx").write_bytes(MODEL + b"!")
     with pytest.raises(InputError, match="SHA-256 is"):
         ModelCard.load(str(card_file), "features")
+
+
+def test_a_shipped_model_is_found_where_a_folder_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "tiny").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert ModelCard.load("tiny", "features").name == "tiny-features"

@@ -203,8 +203,10 @@ def test_progress_counts_up_to_all_moments(root: Path):
 
 
 def test_a_folder_of_another_data_set_is_refused(root: Path):
-    with pytest.raises(SettingsError, match=r"seed 5.*seed 6"):
+    with pytest.raises(SettingsError, match=r": seed is 5, wanted 6; choose another folder"):
         write_dataset(root, TINY, seed=6)
+    with pytest.raises(SettingsError, match=r": preset.lidar is False, wanted True; choose"):
+        write_dataset(root, TINY.model_copy(update={"lidar": True}), seed=5)
 
 
 def test_an_unknown_preset_is_refused_before_anything_is_written(tmp_path: Path):
