@@ -76,7 +76,8 @@ class ResNet(nn.Module):
     def load_weights(self, file: Path) -> None:
         """Take the weights in a safetensors file; the classifier's are ignored.
 
-        The project reads no pickles: turn a .pth file into safetensors first (see perception/README.md). Raises NotFoundError if the file is absent, InputError if it is not of this net.
+        The project reads no pickles: turn a .pth file into safetensors first (see perception/README.md).
+        Raises NotFoundError if the file is absent, InputError if it is not of this net.
         """
         if not file.is_file():
             raise NotFoundError(f"{file} does not exist; give a local file of torchvision's ResNet weights")
