@@ -35,10 +35,13 @@ class SamplingAttention(nn.Module):
         self.weights = nn.Linear(settings.channels, places)
         self._initialise()
 
-    def forward(self, query: Tensor, places: Tensor, memory: Tensor, shapes: Shapes) -> Tensor:
+    def forward(
+        self, query: Tensor, places: Tensor, memory: Tensor, shapes: Shapes, chances: Tensor | None = None
+    ) -> Tensor:
         """What queries (B, Q, C) find around their places (B, Q, R, 2) in memory (B, S, C), all levels' pixels.
 
-        Places are shares of the image; with R > 1 the sampled points take turns around them.
+        Places are shares of the image; with R > 1 the sampled points take turns around them. What is found around a
+        place is scaled by its chance (B, Q, R).
         """
         settings = self.settings
         kinds = (settings.heads, settings.levels, settings.points)
@@ -46,6 +49,8 @@ class SamplingAttention(nn.Module):
         offsets = self.offsets(query).unflatten(-1, (*kinds, 2)) / sizes[:, None]
         turns = places.repeat(1, 1, settings.points // places.shape[2], 1)[:, :, None, None]
         weights = self.weights(query).unflatten(-1, (settings.heads, -1)).softmax(-1).unflatten(-1, kinds[1:])
+        if chances is not None:
+            weights = weights * chances.repeat(1, 1, settings.points // places.shape[2])[:, :, None, None]
         value = self.value(memory).unflatten(-1, (settings.heads, -1))
         return deformable_attention(value, shapes, turns + offsets, weights)
 
@@ -75,8 +80,10 @@ class DeformableAttention(SamplingAttention):
         nn.init.xavier_uniform_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
-    def forward(self, query: Tensor, places: Tensor, memory: Tensor, shapes: Shapes) -> Tensor:
-        return self.output(super().forward(query, places, memory, shapes))
+    def forward(
+        self, query: Tensor, places: Tensor, memory: Tensor, shapes: Shapes, chances: Tensor | None = None
+    ) -> Tensor:
+        return self.output(super().forward(query, places, memory, shapes, chances))
 
 
 class FeedForward(nn.Module):
