@@ -28,6 +28,7 @@ class ResNetSettings:
     stages: tuple[int, ...] = (2, 3, 4)
     frozen_stages: int = 0  # the stem and so many stages never learn; 0 freezes nothing, not even the stem
     norm_eval: bool = False  # batch norms keep the statistics that they were loaded with
+    norm_learns: bool = True  # False: batch norms' scales and shifts are frozen too
     stride_first: bool = False  # a bottleneck's first convolution strides (Caffe) instead of its second (PyTorch)
 
     @property
@@ -53,7 +54,8 @@ class ResNet(nn.Module):
                 inputs = blocks[-1].outputs
             self.add_module(f"layer{stage}", nn.Sequential(*blocks))
         self.apply(_initialise)
-        for module in self._frozen():
+        norms = [] if settings.norm_learns else [part for part in self.modules() if isinstance(part, nn.BatchNorm2d)]
+        for module in (*self._frozen(), *norms):
             module.requires_grad_(False)
 
     def forward(self, images: Tensor) -> list[Tensor]:

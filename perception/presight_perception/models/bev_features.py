@@ -13,6 +13,8 @@ from presight_perception.models.bev_grid import BevGrid
 from presight_perception.models.camera_rig import CameraRig
 from presight_perception.models.view_transform import BevFormer, BevFormerSettings, BilinearLift, LiftSettings
 
+RESNET_50 = ImageEncoderSettings(ResNetSettings(50, norm_eval=True))  # made to be loaded with ImageNet's weights
+
 
 @dataclass(frozen=True)
 class Sources:
@@ -29,10 +31,20 @@ class BevSettings:
     grid: BevGrid = field(default_factory=BevGrid)
     channels: int = 256
     sources: Sources = field(default_factory=Sources)
-    images: ImageEncoderSettings = field(default_factory=ImageEncoderSettings)
+    images: ImageEncoderSettings = RESNET_50
     view: BevFormerSettings | LiftSettings = field(default_factory=BevFormerSettings)
     camera_count: int = 6
     prior_hidden: int = 64  # channels inside the fusion
+
+    def __post_init__(self) -> None:
+        """Raises SettingsError for settings that do not fit each other."""
+        if not self.sources.cameras and self.sources.prior_channels is None:
+            raise SettingsError("a model needs cameras or a prior; set sources.cameras or sources.prior_channels")
+        if isinstance(self.view, BevFormerSettings) and self.images.channels != self.channels:
+            raise SettingsError(
+                f"BEVFormer looks with cells of {self.channels} channels into images of {self.images.channels}; "
+                "give both as many"
+            )
 
     @staticmethod
     def tiny(sources: Sources, grid: BevGrid) -> "BevSettings":
@@ -55,10 +67,7 @@ class BevFeatures(nn.Module):
     """Features (B, channels, rows, columns); row 0 is on the right (least y), column 0 behind (least x)."""
 
     def __init__(self, settings: BevSettings) -> None:
-        """Raises SettingsError if the model would have neither cameras nor a prior."""
         super().__init__()
-        if not (settings.sources.cameras or settings.fusion):
-            raise SettingsError("a model needs cameras or a prior; set sources.cameras or sources.prior_channels")
         self.settings = settings
         self.encoder = ImageEncoder(settings.images) if settings.sources.cameras else None
         self.view = _view(settings) if settings.sources.cameras else None
@@ -67,7 +76,7 @@ class BevFeatures(nn.Module):
     def forward(self, images: Tensor | None, rig: CameraRig | None, prior: PriorBatch | None) -> Tensor:
         """Features of images (B, N, 3, H, W), RGB 0..1, and a prior's voxels.
 
-        Without images the online features are zeros: in a model with cameras that is Table 7's setting a.
+        Without images the online features are zeros: in a model with cameras, that is Table 7's setting a.
         Without a prior, a model that has its fusion gets no voxel. Raises InputError if there is neither.
         """
         if prior is not None and self.fusion is None:

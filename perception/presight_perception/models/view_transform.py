@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from presight_core.errors import SettingsError
 from presight_perception.deformable_attention import deformable_attention
 from presight_perception.models.attention import (
     DROPOUT,
@@ -35,9 +36,20 @@ class BevFormerSettings:
     layer_count: int = 1
     heads: int = 8
     points: int = 8  # of each head in each image level; the heights take turns
+    self_heads: int = 8
     self_points: int = 8  # BEVFormer's 4 in each of two bird's-eye views, which are one without history
     feedforward: int = 512
-    sampling: Literal["learned", "kernel"] = "learned"  # kernel: GKT's 3 x 5 pixels around each projected point
+    sampling: Literal["learned", "kernel"] = "learned"  # kernel: GKT's 3 x 5 pixels, each head at one of the heights
+
+    def __post_init__(self) -> None:
+        if self.sampling == "kernel" and len(self.heights_m) != self.heads:
+            raise SettingsError(
+                f"{self.heads} heads and {len(self.heights_m)} heights; sampling 'kernel' needs a height for each head"
+            )
+        if self.sampling == "learned" and self.points % len(self.heights_m):
+            raise SettingsError(
+                f"{self.points} points cannot be shared by {len(self.heights_m)} heights; take a multiple of them"
+            )
 
 
 class BilinearLift(nn.Module):
@@ -117,26 +129,29 @@ class BevFormer(nn.Module):
 
 
 class KernelAttention(nn.Module):
-    """Weighs the pixels of a small window around each given place; no offsets are learned (GKT)."""
+    """Weighs the pixels of a small window around given places, each head around its own; GKT learns no offsets."""
 
     window: Tensor
 
-    def __init__(self, settings: AttentionSettings, places: int) -> None:
+    def __init__(self, settings: AttentionSettings) -> None:
         super().__init__()
         self.settings = settings
         self.register_buffer("window", _window(3, 5), persistent=False)
         self.value = nn.Linear(settings.channels, settings.channels)
-        self.weights = nn.Linear(settings.channels, settings.heads * settings.levels * places * len(self.window))
+        self.weights = nn.Linear(settings.channels, settings.heads * settings.levels * len(self.window))
+        nn.init.zeros_(self.weights.weight)  # at first, all pixels weigh the same
+        nn.init.zeros_(self.weights.bias)
 
     def forward(self, query: Tensor, places: Tensor, memory: Tensor, shapes: Shapes) -> Tensor:
-        """What queries (B, Q, C) find near their places (B, Q, R, 2) in memory (B, S, C), all levels' pixels."""
+        """What queries (B, Q, C) find near their places (B, Q, heads, 2) in memory (B, S, C), all levels' pixels."""
         settings = self.settings
-        sizes = query.new_tensor([(width, height) for height, width in shapes])[:, None, None]
-        pixels = (places[:, :, None, :, None] * sizes).floor() + self.window  # (B, Q, levels, R, window, 2)
-        found = ((pixels + 0.5) / sizes).flatten(3, 4)[:, :, None].expand(-1, -1, settings.heads, -1, -1, -1)
+        sizes = query.new_tensor([(width, height) for height, width in shapes])[:, None]  # (levels, 1, 2)
+        pixels = (places[:, :, :, None, None] * sizes).floor() + self.window  # (B, Q, heads, levels, window, 2)
+        inside = pixels.clamp(min=0).minimum(sizes - 1)  # beyond the edge, its pixels are repeated
         weights = self.weights(query).unflatten(-1, (settings.heads, -1)).softmax(-1)
         value = self.value(memory).unflatten(-1, (settings.heads, -1))
-        return deformable_attention(value, shapes, found, weights.unflatten(-1, (settings.levels, -1)))
+        weights = weights.unflatten(-1, (settings.levels, -1))
+        return deformable_attention(value, shapes, (inside + 0.5) / sizes, weights)
 
 
 @dataclass(frozen=True)
@@ -160,11 +175,11 @@ class _Views:
 class _BevFormerLayer(nn.Module):
     def __init__(self, settings: BevFormerSettings, channels: int, level_count: int) -> None:
         super().__init__()
-        own = AttentionSettings(channels, settings.heads, 1, settings.self_points)
+        own = AttentionSettings(channels, settings.self_heads, 1, settings.self_points)
         images = AttentionSettings(channels, settings.heads, level_count, settings.points)
         learned = settings.sampling == "learned"
         self.self_attention = DeformableAttention(own)
-        self.sampler = SamplingAttention(images) if learned else KernelAttention(images, len(settings.heights_m))
+        self.sampler = SamplingAttention(images) if learned else KernelAttention(images)
         self.output = nn.Linear(channels, channels)
         self.dropout = nn.Dropout(DROPOUT)
         self.feedforward = FeedForward(channels, settings.feedforward)
