@@ -27,7 +27,7 @@ def targets(model: OccupancyModel) -> list:
 def learn(model: OccupancyModel, step_count: int) -> list[float]:
     """The losses of training on one batch."""
     prior = toy_occupancy.prior() if model.fusion else None
-    optimiser, losses, truths = torch.optim.AdamW(model.parameters(), 1e-2), [], targets(model)
+    optimiser, losses, truths = torch.optim.AdamW(model.parameters(), 2e-2), [], targets(model)
     for _ in range(step_count):
         loss = sum(model.loss(model(*SEEN, prior, [toy_occupancy.earlier()]), truths).values())
         optimiser.zero_grad()
@@ -41,10 +41,10 @@ def learn(model: OccupancyModel, step_count: int) -> list[float]:
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_learns_one_batch_by_heart(name):
     model = toy_occupancy.model(name, CAMERAS)
-    losses = learn(model, 25)
-    assert np.mean(losses[-3:]) < 0.6 * losses[0]
-    scores = OccupancyIou()
-    for found, truth in zip(model.decode(model(*SEEN)), toy_occupancy.truths(), strict=True):
+    losses = learn(model, 20)
+    assert np.mean(losses[-3:]) < losses[0] / 3
+    scores, predictions = OccupancyIou(), model(*SEEN, history=[toy_occupancy.earlier()])
+    for found, truth in zip(model.decode(predictions), toy_occupancy.truths(), strict=True):
         scores.add(found, truth)
     assert scores.result().per_class["driveable_surface"] > 0.8
 

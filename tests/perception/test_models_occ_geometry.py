@@ -172,7 +172,7 @@ def test_each_subvoxel_has_its_own_weights():
 
 def test_the_doubled_head_keeps_places():
     torch.manual_seed(0)
-    head, voxels = LevelMixHead(8, 1, 3).eval(), torch.zeros(1, 8, 4, 5, 6)
+    head, voxels = LevelMixHead(8, 1, (4, 2), 3).eval(), torch.zeros(1, 8, 4, 5, 6)
     changed = voxels.clone()
     changed[0, :, 3, 0, 5] = 5.0  # the top of the front right corner
     change = (head([changed]) - head([voxels]))[0].abs().sum(0)

@@ -70,6 +70,7 @@ class FbOccSettings(OccupancySettings):
     channels: tuple[int, ...] = (64, 128, 256)  # of the 3D ResNet-18
     blocks: tuple[int, ...] = (2, 2, 2)
     pyramid_channels: int = 256
+    head_channels: tuple[int, int] = (128, 64)
     voxel_counts: tuple[int, ...] = NUSCENES_VOXELS
     focal_weight: float = 100.0
     depth_weight: float = 1.0
@@ -93,6 +94,7 @@ class FbOccSettings(OccupancySettings):
             channels=(16, 24, 32),
             blocks=(1, 1, 1),
             pyramid_channels=16,
+            head_channels=(16, 16),
         )
 
 
@@ -112,7 +114,7 @@ class FbOcc(OccupancyModel):
         strides = (1,) + (2,) * (len(settings.channels) - 1)
         self.encoder = ResNet3D(ResNet3DSettings(self.channels, settings.channels, settings.blocks, strides, "fb"))
         self.neck = FeaturePyramid3D(settings.channels, settings.pyramid_channels)
-        self.head = LevelMixHead(settings.pyramid_channels, len(settings.channels), CLASS_COUNT)
+        self.head = LevelMixHead(settings.pyramid_channels, len(settings.channels), settings.head_channels, CLASS_COUNT)
         weights = torch.tensor([1 / math.log(count) for count in settings.voxel_counts])
         self.register_buffer("class_weights", weights, persistent=False)
 

@@ -96,26 +96,25 @@ class FeaturePyramid3D(nn.Module):
 class LevelMixHead(nn.Module):
     """FB-OCC's head: logits at twice the resolution, each voxel weighing the levels of the pyramid for itself."""
 
-    def __init__(self, inputs: int, level_count: int, class_count: int) -> None:
+    def __init__(self, inputs: int, level_count: int, widths: tuple[int, int], class_count: int) -> None:
+        """`widths` are the channels of the mixed levels, and of what the classes are told from."""
         super().__init__()
-        half, quarter = inputs // 2, inputs // 4
+        mixed, hidden = widths
         self.doubled = nn.Sequential(
-            nn.ConvTranspose3d(inputs, half, 2, stride=2, bias=False), nn.BatchNorm3d(half), nn.ReLU()
+            nn.ConvTranspose3d(inputs, mixed, 2, stride=2, bias=False), nn.BatchNorm3d(mixed), nn.ReLU()
         )
-        self.levels = nn.ModuleList(convolution_3d(inputs, half, 3) for _ in range(level_count))
-        self.shares = nn.Sequential(
-            convolution_3d(half, quarter, 1), nn.Conv3d(quarter, level_count + 1, 1, bias=False)
-        )
-        self.classes = nn.Sequential(convolution_3d(half, quarter, 1), nn.Conv3d(quarter, class_count, 1, bias=False))
+        self.levels = nn.ModuleList(convolution_3d(inputs, mixed, 3) for _ in range(level_count))
+        self.shares = nn.Sequential(convolution_3d(mixed, hidden, 1), nn.Conv3d(hidden, level_count + 1, 1, bias=False))
+        self.classes = nn.Sequential(convolution_3d(mixed, hidden, 1), nn.Conv3d(hidden, class_count, 1, bias=False))
 
     def forward(self, levels: list[Tensor]) -> Tensor:
         """Logits (B, classes, 2 Z, 2 Y, 2 X) of levels, fine to coarse, whose finest is (B, inputs, Z, Y, X)."""
         finest = self.doubled(levels[0])
         shares = self.shares(finest).softmax(1)
-        mixed = finest * shares[:, :1]
+        total = finest * shares[:, :1]
         for number, (layer, level) in enumerate(zip(self.levels, levels, strict=True), 1):
-            mixed = mixed + _resized(layer(level), finest.shape[2:]) * shares[:, number : number + 1]
-        return self.classes(mixed)
+            total = total + _resized(layer(level), finest.shape[2:]) * shares[:, number : number + 1]
+        return self.classes(total)
 
 
 class SubvoxelHead(nn.Module):
