@@ -11,8 +11,10 @@ from presight_perception.models.fb_projection import BackwardProjection, Backwar
 from presight_perception.models.lift_splat import DepthBins, LiftSettings, LiftSplat, frustum
 from presight_perception.models.occ_blocks import LevelMixHead, SubvoxelHead
 from presight_perception.models.occ_frames import aligned, centres
+from presight_perception.voxelise import VoxelGrid
 from tests.perception import toy_rig
-from tests.perception.toy_occupancy import GRID
+
+GRID = VoxelGrid((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0), (1.0, 1.0, 1.0))
 
 FINE = DepthBins(1.0, 12.0, 0.25)
 FEATURES = (16, 32)  # of images of 32 x 64 pixels

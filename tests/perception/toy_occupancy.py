@@ -1,4 +1,4 @@
-"""Occupancy models, truth and a prior of 16 x 16 x 4 m, for tests."""
+"""Occupancy models, truth and a prior of 12.8 x 12.8 x 3.2 m, for tests."""
 
 from dataclasses import replace
 
@@ -16,9 +16,7 @@ from presight_perception.occupancy_truth import OccupancyTruth
 from presight_perception.voxelise import VoxelGrid
 from tests.perception import toy_rig
 
-LOW, HIGH = (-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)
-GRID = VoxelGrid(LOW, HIGH, (1.0, 1.0, 1.0))
-PRIOR_GRID = VoxelGrid(LOW, HIGH, (0.5, 0.5, 0.5))
+GRID = VoxelGrid((-6.4, -6.4, -1.0), (6.4, 6.4, 2.2), (0.8, 0.8, 0.8))  # 16 x 16 x 4 voxels
 BINS = DepthBins(1.0, 11.0, 1.0)
 MODELS = {"bevdet": (BevDetOcc, BevDetOccSettings), "fb": (FbOcc, FbOccSettings)}
 CAMERAS, BOTH, PRIOR = Sources(), Sources(prior_channels=6), Sources(cameras=False, prior_channels=6)
@@ -28,27 +26,26 @@ def model(name: str, sources: Sources = BOTH, earlier_frames: int = 1) -> Occupa
     """A tiny model on the toy grid."""
     torch.manual_seed(0)
     kind, settings = MODELS[name]
-    tiny = settings.tiny(sources)
-    lift = replace(tiny.lift, bins=BINS)
-    return kind(replace(tiny, grid=GRID, prior_grid=PRIOR_GRID, lift=lift, earlier_frames=earlier_frames))
+    tiny = settings.tiny(sources, GRID)
+    return kind(replace(tiny, lift=replace(tiny.lift, bins=BINS), earlier_frames=earlier_frames))
 
 
 def prior(batch: int = 2, voxel_count: int = 400) -> PriorBatch:
     random = torch.Generator().manual_seed(4)
-    shape = (batch, *PRIOR_GRID.shape)
+    shape = (batch, 32, 32, 20)  # of the prior's voxels
     rows = torch.randperm(int(np.prod(shape)), generator=random)[:voxel_count].numpy()
     coordinates = torch.from_numpy(np.stack(np.unravel_index(rows, shape), -1))
     return PriorBatch(torch.randn(voxel_count, 6, generator=random), coordinates, torch.eye(3).repeat(batch, 1, 1))
 
 
 def truths(batch: int = 2) -> list[OccupancyTruth]:
-    """A road under free space, a wall on the left of the first sample and on the right of the second; 0.5 m voxels."""
+    """Occ3D's range: a road, and a wall on the left of the first sample and on the right of the second."""
     found = []
     for number in range(batch):
-        semantics = np.full((32, 32, 8), 17, np.uint8)
+        semantics = np.full((200, 200, 16), 17, np.uint8)
         semantics[:, :, 1] = 11
-        semantics[:, 24:28, 2:6] = 15
-        mask = np.random.default_rng(number).random((32, 32, 8)) < 0.7
+        semantics[:, 108:112, 2:6] = 15  # 3.2 to 4.8 m left of the vehicle
+        mask = np.random.default_rng(number).random((200, 200, 16)) < 0.7
         found.append(OccupancyTruth(semantics if number % 2 == 0 else semantics[:, ::-1].copy(), mask, mask))
     return found
 

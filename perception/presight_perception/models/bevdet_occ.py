@@ -35,6 +35,7 @@ from presight_perception.models.occ_model import (
     OnlineVoxels,
     image_size,
 )
+from presight_perception.voxelise import VoxelGrid
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,12 @@ class BevDetOccSettings(OccupancySettings):
         return BevDetOccSettings(sources or Sources())
 
     @staticmethod
-    def tiny(sources: Sources | None = None) -> "BevDetOccSettings":
+    def tiny(sources: Sources | None = None, grid: VoxelGrid = HALF_GRID) -> "BevDetOccSettings":
         """Trains on two processor cores: voxels of 0.8 m, each of which predicts 2 x 2 x 2 classes."""
         return BevDetOccSettings(
             sources or Sources(),
             TINY_RESNET,
-            HALF_GRID,
+            grid,
             prior_hidden=16,
             prior_flat=64,
             lift=LiftSettings(64, 32, context=16, bins=DepthBins(step_m=1.0), aspp_width=16),

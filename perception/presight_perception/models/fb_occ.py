@@ -81,11 +81,12 @@ class FbOccSettings(OccupancySettings):
         return FbOccSettings(sources or Sources())
 
     @staticmethod
-    def tiny(sources: Sources | None = None) -> "FbOccSettings":
+    def tiny(sources: Sources | None = None, grid: VoxelGrid = HALF_GRID) -> "FbOccSettings":
         """Trains on two processor cores."""
         return FbOccSettings(
             sources or Sources(),
             TINY_RESNET,
+            grid,
             earlier_frames=1,
             prior_hidden=16,
             prior_flat=64,

@@ -15,7 +15,7 @@ from presight_core.errors import InputError
 from presight_perception.models.camera_rig import CameraRig
 from presight_perception.models.lift_splat import DepthBins, depth_bins, moved
 from presight_perception.models.occ_losses import depth_loss
-from presight_perception.occupancy_truth import OCCUPANCY_CLASSES, UNKNOWN, OccupancyTruth
+from presight_perception.occupancy_truth import OCCUPANCY_CLASSES, RANGE_LOW_M, UNKNOWN, VOXEL_M, OccupancyTruth
 from presight_perception.voxelise import VoxelGrid
 
 CLASS_COUNT = len(OCCUPANCY_CLASSES)
@@ -58,6 +58,19 @@ class OccupancyTarget:
     def of(cls, truth: OccupancyTruth, depth_m: Tensor | None = None) -> "OccupancyTarget":
         """The voxels that a camera saw, as in the originals."""
         return cls(torch.from_numpy(np.where(truth.mask_camera, truth.semantics, np.uint8(UNKNOWN))), depth_m)
+
+
+def within(truth: OccupancyTruth, grid: VoxelGrid) -> OccupancyTruth:
+    """The part of Occ3D's truth that lies in a grid's box. Raises InputError if the box reaches beyond it."""
+    first = [round((edge - low) / VOXEL_M) for edge, low in zip(grid.low_m, RANGE_LOW_M, strict=True)]
+    last = [round((edge - low) / VOXEL_M) for edge, low in zip(grid.high_m, RANGE_LOW_M, strict=True)]
+    if min(first) < 0 or any(end > count for end, count in zip(last, truth.semantics.shape, strict=True)):
+        raise InputError(
+            f"truth of {truth.semantics.shape} voxels does not cover {grid.low_m} to {grid.high_m} m; "
+            "give all of Occ3D's range, or a smaller grid"
+        )
+    box = tuple(slice(start, end) for start, end in zip(first, last, strict=True))
+    return OccupancyTruth(truth.semantics[box], truth.mask_camera[box], truth.mask_lidar[box])
 
 
 def known_voxels(logits: Tensor, truths: Sequence[OccupancyTarget]) -> tuple[Tensor, Tensor]:
