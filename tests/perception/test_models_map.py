@@ -88,6 +88,22 @@ def test_every_weight_learns(name):
         assert idle == []
 
 
+def test_map_tr_moves_points_from_where_the_last_layer_left_them():
+    model = tiny("map_tr").eval()
+    assert isinstance(model, MapTr)
+    for name, weight in model.refine.named_parameters():
+        torch.nn.init.constant_(weight, 0.5 if name.endswith("4.bias") else 0.0)  # of the last of five layers
+    with torch.no_grad():
+        places = model(toy_rig.pictures(), toy_rig.rig()).lines.logit()
+    torch.testing.assert_close(places[1], places[0] + 0.5, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["stream_map_net", "map_tr"])
+def test_vector_models_begin_by_hardly_believing_in_any_line(name):
+    predictions = tiny(name)(toy_rig.pictures(), toy_rig.rig())
+    assert predictions.logits.sigmoid().mean() < 0.05
+
+
 @pytest.mark.parametrize("name", ["stream_map_net", "map_tr"])
 def test_vector_models_give_the_metric_lines_in_metres(name):
     model = tiny(name).eval()

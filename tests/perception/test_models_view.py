@@ -108,14 +108,29 @@ def test_a_batch_of_rigs_is_seen_like_each_alone(sampling):
         torch.testing.assert_close(together[sample], module([level[sample : sample + 1]], own, SIZE)[0])
 
 
-def test_attention_at_a_cells_centre_finds_that_cell():
+def test_a_cell_that_two_cameras_see_alike_looks_as_through_one():
+    settings = BevFormerSettings(ROAD, heads=2, points=2, self_heads=2, feedforward=8)
+    module, rig, level = bev_former(settings), toy_rig.rig(1), torch.rand(1, 1, 8, 8, 16)
+    torch.nn.init.zeros_(module.camera_embedding)
+    once, twice = (CameraRig(rig.intrinsics[:, :count], rig.ego_from_camera[:, [0] * count]) for count in (1, 2))
+    both = module([level.expand(-1, 2, -1, -1, -1)], twice, SIZE)
+    module.camera_embedding = torch.nn.Parameter(module.camera_embedding[:1].detach())
+    torch.testing.assert_close(both, module([level], once, SIZE))
+
+
+@pytest.mark.parametrize("offset", [(0, 0), (1, 0), (0, 1), (2, -1)])
+def test_attention_finds_the_cell_at_its_offset(offset):
+    """The first number counts columns, to the front; the second rows, to the left."""
     attention = DeformableAttention(AttentionSettings(4, heads=1, points=1))
     for layer in (attention.value, attention.output):
         torch.nn.init.eye_(layer.weight)
-    torch.nn.init.zeros_(attention.offsets.bias)
-    memory = torch.rand(1, GRID.rows * GRID.columns, 4)
-    found = attention(memory, GRID.centres().view(1, -1, 1, 2), memory, [(GRID.rows, GRID.columns)])
-    torch.testing.assert_close(found, memory)
+    with torch.no_grad():
+        attention.offsets.bias.copy_(torch.tensor(offset))
+    memory, shape = torch.rand(1, GRID.rows * GRID.columns, 4), (GRID.rows, GRID.columns)
+    found = attention(memory, GRID.centres().view(1, -1, 1, 2), memory, [shape])
+    row, column = LEFT_AHEAD[0], LEFT_AHEAD[1] - 2
+    expected = memory.view(*shape, 4)[row + offset[1], column + offset[0]]
+    torch.testing.assert_close(found.view(*shape, 4)[row, column], expected)
 
 
 def test_kernels_need_a_height_for_each_head():
