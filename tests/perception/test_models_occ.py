@@ -10,8 +10,10 @@ from presight_core.errors import InputError, SettingsError
 from presight_perception.metrics import OccupancyIou
 from presight_perception.models.bev_features import Sources
 from presight_perception.models.bevdet_occ import BevDetOcc, BevDetOccSettings
+from presight_perception.models.camera_rig import CameraRig
 from presight_perception.models.fb_occ import FbOcc, FbOccSettings
 from presight_perception.models.lift_splat import LiftSettings
+from presight_perception.models.occ_frames import PastFrame
 from presight_perception.models.occ_model import OccupancyModel
 from tests.perception import toy_occupancy, toy_rig
 from tests.perception.toy_occupancy import CAMERAS, MODELS, PRIOR
@@ -95,6 +97,22 @@ def test_history_changes_what_is_found(name):
     model = toy_occupancy.model(name, CAMERAS).eval()
     now, before = model(*SEEN).logits, model(*SEEN, history=[toy_occupancy.earlier()]).logits
     assert (now - before).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_batch_is_seen_like_its_samples_alone(name):
+    model = toy_occupancy.model(name, CAMERAS, earlier_frames=2).eval()
+    images, rig = toy_rig.pictures(), toy_rig.rig()
+    turned = rig.augmented(
+        torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]])
+    )
+    together = model(images, turned, history=[toy_occupancy.earlier()]).logits
+    for sample in range(2):
+        own = slice(sample, sample + 1)
+        frame = toy_occupancy.earlier()
+        history = [PastFrame(frame.past_from_now[own], frame.age_s[own], frame.images[own], toy_rig.rig(1))]
+        alone = model(images[own], CameraRig(turned.intrinsics[own], turned.ego_from_camera[own]), history=history)
+        torch.testing.assert_close(together[own], alone.logits, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", MODELS)

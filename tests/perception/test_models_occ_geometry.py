@@ -57,6 +57,17 @@ def test_lifted_points_project_back_to_the_centres_of_their_pixels():
     torch.testing.assert_close(places, torch.stack([u, v], -1))
 
 
+def test_a_mirrored_rig_sees_a_mirrored_world():
+    torch.manual_seed(0)
+    lift = LiftSplat(LiftSettings(4, 8, 3, FINE, camera_aware=False), GRID)
+    features, rig = torch.randn(1, 2, 4, *FEATURES), toy_rig.rig(1)
+    mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0]))[None]
+    plain = lift(features, rig, toy_rig.SIZE)[0][..., 1:-1, :]  # without the edges: see `bev_pool`
+    mirrored = lift(features, rig.augmented(mirror), toy_rig.SIZE)[0][..., 1:-1, :]
+    assert plain.abs().max() > 0
+    torch.testing.assert_close(mirrored, plain.flip(3), atol=1e-5, rtol=1e-4)
+
+
 def a_feature_at(point_ego: tuple[float, float, float]) -> torch.Tensor:
     voxels = torch.zeros(1, 1, *reversed(GRID.shape))
     voxels[0, 0][voxel_of(point_ego)] = 1.0

@@ -28,7 +28,7 @@ from presight_perception.models.occ_frames import (
 )
 from presight_perception.models.occ_losses import cross_entropy_loss
 from presight_perception.models.occ_model import (
-    HALF_GRID,
+    NEAR_GRID,
     TINY_RESNET,
     OccupancyModel,
     OccupancySettings,
@@ -54,8 +54,8 @@ class BevDetOccSettings(OccupancySettings):
         return BevDetOccSettings(sources or Sources())
 
     @staticmethod
-    def tiny(sources: Sources | None = None, grid: VoxelGrid = HALF_GRID) -> "BevDetOccSettings":
-        """Trains on two processor cores: voxels of 0.8 m, each of which predicts 2 x 2 x 2 classes."""
+    def tiny(sources: Sources | None = None, grid: VoxelGrid = NEAR_GRID) -> "BevDetOccSettings":
+        """Trains on two processor cores: 20 m around, in voxels of 0.8 m that predict 2 x 2 x 2 classes each."""
         return BevDetOccSettings(
             sources or Sources(),
             TINY_RESNET,

@@ -42,6 +42,7 @@ from presight_perception.models.occ_losses import (
 )
 from presight_perception.models.occ_model import (
     HALF_GRID,
+    NEAR_GRID,
     TINY_RESNET,
     OccupancyModel,
     OccupancySettings,
@@ -81,8 +82,8 @@ class FbOccSettings(OccupancySettings):
         return FbOccSettings(sources or Sources())
 
     @staticmethod
-    def tiny(sources: Sources | None = None, grid: VoxelGrid = HALF_GRID) -> "FbOccSettings":
-        """Trains on two processor cores."""
+    def tiny(sources: Sources | None = None, grid: VoxelGrid = NEAR_GRID) -> "FbOccSettings":
+        """Trains on two processor cores: 20 m around, one earlier frame."""
         return FbOccSettings(
             sources or Sources(),
             TINY_RESNET,
