@@ -4,8 +4,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from presight_core.errors import InputError
+from presight_core.errors import InputError, SettingsError
 from presight_perception.models.backbone import ImageEncoder, ImageEncoderSettings, ResNet, ResNetSettings
+from presight_perception.models.deformable_convolution import DeformableConvolution
 
 TINY = ResNetSettings(depth=10, width=4)
 
@@ -62,3 +63,35 @@ def test_frozen_stages_do_not_learn():
     learning = {name.split(".")[0] for name, weight in network.named_parameters() if weight.grad is not None}
     assert learning == {"layer2", "layer3", "layer4"}
     assert not network.state_dict()["bn1.running_mean"].any()
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_deformable_convolution_begins_as_half_a_plain_one(stride):
+    layer, features = DeformableConvolution(3, 4, stride), torch.rand(2, 3, 5, 6)
+    plain = torch.nn.functional.conv2d(features, layer.weight, stride=stride, padding=1)
+    torch.testing.assert_close(layer(features), plain / 2)
+
+
+def test_a_deformable_convolution_looks_where_its_offsets_say():
+    layer, features = DeformableConvolution(3, 4, 1), torch.rand(1, 3, 5, 6)
+    with torch.no_grad():
+        assert layer.offset.bias is not None
+        layer.offset.bias[1:18:2] = 1.0  # all taps one pixel to the right
+        layer.offset.bias[18:] = 30.0  # all count fully
+    plain = torch.nn.functional.conv2d(features.roll(-1, 3), layer.weight, padding=1)
+    torch.testing.assert_close(layer(features)[..., 1:-2], plain[..., 1:-2])
+
+
+def test_plain_weights_load_into_deformable_stages(tmp_path):
+    plain = ResNet(ResNetSettings(50, width=4))
+    save_file(plain.state_dict(), tmp_path / "weights.safetensors")
+    network = ResNet(ResNetSettings(50, width=4, deformable_stages=(4,)))
+    network.load_weights(tmp_path / "weights.safetensors")
+    name = "layer4.0.conv2.weight"
+    assert torch.equal(network.state_dict()[name], plain.state_dict()[name])
+    assert not network.state_dict()["layer4.0.conv2.offset.weight"].any()
+
+
+def test_deformable_stages_need_bottlenecks():
+    with pytest.raises(SettingsError, match="ResNet-18 has no bottlenecks"):
+        ResNetSettings(18, deformable_stages=(4,))

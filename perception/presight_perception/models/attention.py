@@ -93,6 +93,7 @@ class FeedForward(nn.Module):
         super().__init__()
         first = [nn.Linear(channels, hidden), nn.ReLU(), nn.Dropout(DROPOUT)]
         self.layers = nn.Sequential(*first, nn.Linear(hidden, channels), nn.Dropout(DROPOUT))
+        self.apply(initialise_linear)
 
     def forward(self, features: Tensor) -> Tensor:
         return features + self.layers(features)
@@ -118,6 +119,12 @@ class DecoderLayer(nn.Module):
         found = self.cross_attention(query + position, places, memory, shape)
         query = self.norms[1](query + self.dropout(found))
         return self.norms[2](self.feedforward(query))
+
+
+def initialise_linear(layer: nn.Module) -> None:
+    """Glorot's initialisation, which the released transformers have everywhere; for `Module.apply`."""
+    if isinstance(layer, nn.Linear):
+        nn.init.xavier_uniform_(layer.weight)
 
 
 def sine_positions(rows: int, columns: int, channels: int) -> Tensor:

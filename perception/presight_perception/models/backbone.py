@@ -13,7 +13,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from presight_core.errors import InputError, NotFoundError
+from presight_core.errors import InputError, NotFoundError, SettingsError
+from presight_perception.models.deformable_convolution import DeformableConvolution
 
 BLOCK_COUNTS = {10: (1, 1, 1, 1), 18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
 IMAGE_MEAN, IMAGE_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's red, green and blue
@@ -29,7 +30,14 @@ class ResNetSettings:
     frozen_stages: int = 0  # the stem and so many stages never learn; 0 freezes nothing, not even the stem
     norm_eval: bool = False  # batch norms keep the statistics that they were loaded with
     norm_learns: bool = True  # False: batch norms' scales and shifts are frozen too
+    deformable_stages: tuple[int, ...] = ()  # whose 3 x 3 convolutions learn where to look; of bottlenecks only
     stride_first: bool = False  # a bottleneck's first convolution strides (Caffe) instead of its second (PyTorch)
+
+    def __post_init__(self) -> None:
+        if self.deformable_stages and self.depth < 50:
+            raise SettingsError(
+                f"ResNet-{self.depth} has no bottlenecks for deformable_stages {self.deformable_stages}; set none"
+            )
 
     @property
     def channels(self) -> tuple[int, ...]:
@@ -85,7 +93,8 @@ class ResNet(nn.Module):
             raise NotFoundError(f"{file} does not exist; give a local file of torchvision's ResNet weights")
         weights = {name: value for name, value in _read(file).items() if not name.startswith("fc.")}
         own = self.state_dict()
-        lacking = {name for name in own.keys() - weights.keys() if not name.endswith("num_batches_tracked")}
+        own_alone = ("num_batches_tracked", "offset.weight", "offset.bias")  # published weights may lack them
+        lacking = {name for name in own.keys() - weights.keys() if not name.endswith(own_alone)}
         different = [name for name in own.keys() & weights.keys() if own[name].shape != weights[name].shape]
         wrong = sorted([*lacking, *different, *(weights.keys() - own.keys() - self._later_stages(weights))])
         if wrong:
@@ -127,13 +136,17 @@ class Basic(nn.Module):
 class Bottleneck(nn.Module):
     """The block of ResNet-50 and -101."""
 
-    def __init__(self, inputs: int, width: int, stride: int, stride_first: bool) -> None:
+    def __init__(self, settings: ResNetSettings, inputs: int, stage: int, stride: int) -> None:
         super().__init__()
+        width = settings.width * 2 ** (stage - 1)
         self.outputs = 4 * width
-        first, second = (stride, 1) if stride_first else (1, stride)
+        first, second = (stride, 1) if settings.stride_first else (1, stride)
         self.conv1 = nn.Conv2d(inputs, width, 1, first, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
-        self.conv2 = nn.Conv2d(width, width, 3, second, padding=1, bias=False)
+        if stage in settings.deformable_stages:
+            self.conv2 = DeformableConvolution(width, width, second)
+        else:
+            self.conv2 = nn.Conv2d(width, width, 3, second, padding=1, bias=False)
         self.bn2 = nn.BatchNorm2d(width)
         self.conv3 = nn.Conv2d(width, self.outputs, 1, bias=False)
         self.bn3 = nn.BatchNorm2d(self.outputs)
@@ -197,10 +210,10 @@ class ImageEncoder(nn.Module):
 
 
 def _block(settings: ResNetSettings, inputs: int, stage: int, first: bool) -> Basic | Bottleneck:
-    width, stride = settings.width * 2 ** (stage - 1), 2 if first and stage > 1 else 1
+    stride = 2 if first and stage > 1 else 1
     if settings.depth < 50:
-        return Basic(inputs, width, stride)
-    return Bottleneck(inputs, width, stride, settings.stride_first)
+        return Basic(inputs, settings.width * 2 ** (stage - 1), stride)
+    return Bottleneck(settings, inputs, stage, stride)
 
 
 def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Module:
@@ -212,6 +225,8 @@ def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Module:
 def _initialise(layer: nn.Module) -> None:
     if isinstance(layer, nn.Conv2d):
         nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
+    elif isinstance(layer, DeformableConvolution):  # after its parts: `apply` goes from the inside out
+        layer.initialise()
 
 
 def _initialise_pyramid(layer: nn.Module) -> None:

@@ -13,7 +13,8 @@ from presight_perception.models.bev_grid import BevGrid
 from presight_perception.models.camera_rig import CameraRig
 from presight_perception.models.view_transform import BevFormer, BevFormerSettings, BilinearLift, LiftSettings
 
-RESNET_50 = ImageEncoderSettings(ResNetSettings(50, norm_eval=True))  # made to be loaded with ImageNet's weights
+# Made to be loaded with ImageNet's weights.
+RESNET_50 = ImageEncoderSettings(ResNetSettings(50, norm_eval=True, deformable_stages=(3, 4)))
 
 
 @dataclass(frozen=True)

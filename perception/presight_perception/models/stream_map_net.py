@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from presight_perception.map_truth import MAP_CLASSES, MapLines
 from presight_perception.metrics import ScoredLines
-from presight_perception.models.attention import AttentionSettings, DecoderLayer, sine_positions
+from presight_perception.models.attention import AttentionSettings, DecoderLayer, initialise_linear, sine_positions
 from presight_perception.models.bev_features import TINY_GRID, BevSettings, Sources
 from presight_perception.models.bev_grid import BevGrid
 from presight_perception.models.line_loss import LineLossSettings, LinePredictions, line_losses
@@ -60,6 +60,8 @@ class StreamMapNet(MapModel[LinePredictions, LineTruth]):
         self.layers = nn.ModuleList(layers)
         self.classify = nn.Linear(channels, len(MAP_CLASSES))
         self.draw = _drawing(channels, settings.regression, 2 * points)
+        for part in (self.first_line, self.draw):
+            part.apply(initialise_linear)
         rare_class_bias(self.classify)
 
     def predict(self, bev: Tensor) -> LinePredictions:
