@@ -1,0 +1,1 @@
+"""The paper's perception models in plain PyTorch, in published and in tiny sizes."""
