@@ -34,7 +34,9 @@ def prior(batch: int = 2, channels: int = 6, voxel_count: int = 200) -> PriorBat
     shape = GRID.prior_grid.shape
     rows = torch.randperm(batch * int(np.prod(shape)), generator=random)[:voxel_count].numpy()
     coordinates = torch.from_numpy(np.stack(np.unravel_index(rows, (batch, *shape)), -1))
-    return PriorBatch(torch.randn(voxel_count, channels, generator=random), coordinates, torch.eye(3).repeat(batch, 1, 1))
+    return PriorBatch(
+        torch.randn(voxel_count, channels, generator=random), coordinates, torch.eye(3).repeat(batch, 1, 1)
+    )
 
 
 def lines(side: float = 1.0) -> MapLines:
@@ -43,6 +45,6 @@ def lines(side: float = 1.0) -> MapLines:
     along = np.array([[-11.0, 0], [0, 0.2], [11, 0]])
     return {
         "ped_crossing": [crossing],
-        "divider": [along + [0, 2 * side], along],
-        "boundary": [along + [0, 5 * side]],
+        "divider": [along + np.array([0, 2 * side]), along],
+        "boundary": [along + np.array([0, 5 * side])],
     }
