@@ -23,7 +23,6 @@ import numpy as np
 from presight_core.cameras import Camera
 from presight_core.synthetic.city import City
 from presight_core.synthetic.renderer import Renderer
-from presight_core.synthetic.rig import RIG
 from presight_core.synthetic.shadow import Shadows
 from presight_core.synthetic.views import View, random_view
 
@@ -112,8 +111,7 @@ def seconds_a_rig(city: City, case: Case, seed: int) -> tuple[float, float]:
 
 def shoot(renderer: Renderer, view: View, camera: Camera, shadows: Shadows) -> None:
     """One image, as data sets are made."""
-    ego = view.cameras[0].world_from_camera @ np.linalg.inv(RIG[0].ego_from_camera)
-    renderer.render([camera], view.lighting, view.actors, shadows, ego=ego)
+    renderer.render([camera], view.lighting, view.actors, shadows, ego=view.world_from_ego)
 
 
 if __name__ == "__main__":

@@ -10,15 +10,43 @@ WHOLE_CROP_PX = 224, 192  # height, width: half an image, so that a batch holds 
 COARSE_CROP_PX = 112, 192  # nearly a whole image at half its scale
 STRETCHED_SHARE = 0.35  # of the samples; the others keep the scale at which the city is rendered
 FAULTY_SHARE = 0.35  # of the samples: with faults in all of them, cars took three times as long to be learned
+RARE = 0.03  # a class of fewer pixels than this share is sought
+SEEN_PX = 60  # in images that show at least so many pixels of it
 GREY_SHARE = 0.4  # of the faulty samples: drives with grey cameras exist
 
 
+class Finder:
+    """Chooses what to look at: any image, or a place of a class that fills little of the images."""
+
+    def __init__(self, labels: NDArray[np.uint8], rare_share: float, rng: np.random.Generator):
+        self._labels, self._rare_share, self._rng = labels, rare_share, rng
+        counts = np.stack([np.bincount(each.ravel(), minlength=UNKNOWN + 1)[:UNKNOWN] for each in labels])
+        share = counts.sum(0) / labels.size
+        self._rare = [c for c in np.flatnonzero(share) if share[c] < RARE and (counts[:, c] >= SEEN_PX).any()]
+        self._images = {c: np.flatnonzero(counts[:, c] >= SEEN_PX) for c in self._rare}
+
+    def place(self) -> tuple[int, tuple[float, float] | None]:
+        """An image's number, and a pixel (row, column) to look at or None."""
+        if not self._rare or self._rng.random() >= self._rare_share:
+            return int(self._rng.integers(len(self._labels))), None
+        wanted = self._rng.choice(self._rare)
+        image = int(self._rng.choice(self._images[wanted]))
+        pixels = np.flatnonzero(self._labels[image] == wanted)
+        row, column = divmod(int(self._rng.choice(pixels)), self._labels.shape[2])
+        return image, (row, column)
+
+
 def random_crop(
-    rgb: NDArray[np.uint8], labels: NDArray[np.uint8], size_px: tuple[int, int], rng: np.random.Generator
+    rgb: NDArray[np.uint8],
+    labels: NDArray[np.uint8],
+    size_px: tuple[int, int],
+    rng: np.random.Generator,
+    focus: tuple[float, float] | None = None,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """A part of an image and of its label map, scaled to `size_px` (height, width), maybe mirrored or stretched.
 
-    Stretched, because every image is brought to 16:9, whatever its own shape.
+    Stretched, because every image is brought to 16:9, whatever its own shape. `focus` (row, column) is a place that
+    the part shows, somewhere off its border.
     """
     height, width = labels.shape
     crop_height, crop_width = size_px
@@ -27,8 +55,8 @@ def random_crop(
         zoom_y *= np.exp(rng.uniform(0.0, 0.5))
         zoom_x = zoom_y * np.exp(rng.uniform(-0.65, 0.2))  # -0.6 is what a panorama of 3.3:1 suffers
     zoom_x = max(zoom_x, crop_width / width)
-    left = rng.uniform(0, width - crop_width / zoom_x)
-    top = rng.uniform(0, height - crop_height / zoom_y)
+    top = _start(height, crop_height / zoom_y, focus and focus[0], rng)
+    left = _start(width, crop_width / zoom_x, focus and focus[1], rng)
     # Both grids have their first pixel's centre at 0.5, OpenCV's at 0.
     crop_from_image = np.array(
         [[zoom_x, 0, (0.5 - left) * zoom_x - 0.5], [0, zoom_y, (0.5 - top) * zoom_y - 0.5]], np.float64
@@ -41,6 +69,13 @@ def random_crop(
         labels, crop_from_image, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN
     )
     return crop.astype(np.uint8, copy=False), crop_labels.astype(np.uint8, copy=False)
+
+
+def _start(length: float, part: float, focus: float | None, rng: np.random.Generator) -> float:
+    """Where a part of a length begins, anywhere or such that it holds the focus."""
+    if focus is None:
+        return rng.uniform(0, length - part)
+    return float(np.clip(focus - part * rng.uniform(0.15, 0.85), 0, length - part))
 
 
 def another_camera(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:

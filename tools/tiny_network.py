@@ -6,48 +6,54 @@ from pathlib import Path
 import onnx
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d, interpolate, relu
+from torch.nn.functional import adaptive_avg_pool2d, interpolate, pixel_shuffle, relu
 
 from presight_core.classes import CITYSCAPES
 
 CLASS_COUNT = len(CITYSCAPES)
 FEATURE_CHANNELS = 64  # as many as a prior keeps
 INPUT_HEIGHT_PX, INPUT_WIDTH_PX = 224, 400  # 16:9 but for one row, and whole strides of 8
-LOGIT_STRIDE, FEATURE_STRIDE = 4, 8
+LOGIT_STRIDE, FEATURE_STRIDE = 2, 8
 OPSET = (
     17  # the newest that torch's own exporter writes without further packages and that every runtime since 2022 reads
 )
 
 
 class TinyNetwork(nn.Module):
-    """Encoder to stride 32, decoder to stride 8 (the features), one more step to stride 4 (the logits).
+    """Encoder to stride 32, decoder to stride 8 (the features), two more steps to stride 2 (the logits).
 
     The features are the bounded bottleneck that the logits are made from, and a linear classifier reads the
     classes off them during training: patches of one kind therefore lie together, which is what PCA and a
-    neural field need of them.
+    neural field need of them. Poles, signs and riders need stride 2: at stride 4 the best label map of poles
+    overlaps the truth by 0.59, at stride 2 by 0.74.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.to_stride_4 = nn.Sequential(_convolve(3, 16, 2), _convolve(16, 24, 2), _Residual(24))
-        self.to_stride_8 = nn.Sequential(_convolve(24, 48, 2), _Residual(48))
+        self.to_stride_2 = _convolve(3, 16, 2)
+        self.to_stride_4 = _convolve(16, 32, 2)
+        self.to_stride_8 = nn.Sequential(_convolve(32, 48, 2), _Residual(48))
         self.to_stride_16 = nn.Sequential(_convolve(48, 64, 2), _Residual(64))
         self.to_stride_32 = nn.Sequential(_convolve(64, 96, 2), _Residual(96))
         self.from_stride_32 = _convolve(96, FEATURE_CHANNELS, size=1)
         self.from_stride_16 = _convolve(64, FEATURE_CHANNELS, size=1)
         self.from_stride_8 = _convolve(48, FEATURE_CHANNELS, size=1)
-        self.from_stride_4 = nn.Conv2d(24, 32, 1)
+        self.from_stride_4 = nn.Conv2d(32, 32, 1)
+        self.from_stride_2 = nn.Conv2d(16, 16, 1)
         self.refine_16 = _convolve(FEATURE_CHANNELS, FEATURE_CHANNELS)
         self.refine_8 = _convolve(FEATURE_CHANNELS, FEATURE_CHANNELS)
         self.to_features = nn.Conv2d(FEATURE_CHANNELS, FEATURE_CHANNELS, 1)
         self.from_features = nn.Conv2d(FEATURE_CHANNELS, 32, 1)
         self.refine_4 = _convolve(32, 32)
-        self.to_logits = nn.Conv2d(32, CLASS_COUNT, 1)
+        self.to_quarters = nn.Conv2d(32, 4 * 16, 1)  # the four cells of stride 2 within one of stride 4
+        self.refine_2 = _convolve(16, 16)
+        self.to_logits = nn.Conv2d(16, CLASS_COUNT, 1)
         self.feature_classifier = nn.Conv2d(FEATURE_CHANNELS, CLASS_COUNT, 1)  # for training only
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits (N, 19, H/4, W/4) and features (N, 64, H/8, W/8) in [-1, 1] of normalised images (N, 3, H, W)."""
-        at_4 = self.to_stride_4(image)
+        """Logits (N, 19, H/2, W/2) and features (N, 64, H/8, W/8) in [-1, 1] of normalised images (N, 3, H, W)."""
+        at_2 = self.to_stride_2(image)
+        at_4 = self.to_stride_4(at_2)
         at_8 = self.to_stride_8(at_4)
         at_16 = self.to_stride_16(at_8)
         deep = self.from_stride_32(self.to_stride_32(at_16))
@@ -55,8 +61,9 @@ class TinyNetwork(nn.Module):
         deep = self.refine_16(self.from_stride_16(at_16) + _enlarged(deep, at_16))
         deep = self.refine_8(self.from_stride_8(at_8) + _enlarged(deep, at_8))
         features = torch.tanh(self.to_features(deep))
-        fine = relu(self.from_stride_4(at_4) + _enlarged(self.from_features(features), at_4))
-        return self.to_logits(self.refine_4(fine)), features
+        fine = self.refine_4(relu(self.from_stride_4(at_4) + _enlarged(self.from_features(features), at_4)))
+        finest = self.refine_2(relu(self.from_stride_2(at_2) + pixel_shuffle(self.to_quarters(fine), 2)))
+        return self.to_logits(finest), features
 
 
 class _Residual(nn.Module):

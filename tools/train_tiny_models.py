@@ -11,14 +11,15 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tiny_augment import COARSE_CROP_PX, WHOLE_CROP_PX, another_camera, random_crop
+from tiny_augment import COARSE_CROP_PX, WHOLE_CROP_PX, Finder, another_camera, random_crop
+from tiny_losses import class_weights, segmentation_loss
 from tiny_network import (
     CLASS_COUNT,
     FEATURE_CHANNELS,
@@ -32,9 +33,8 @@ from tiny_network import (
 from tiny_scores import Scores, confusion, neighbour_accuracy, scores
 from tiny_views import LabelledImages, training_views, unseen_views
 from torch import Tensor
-from torch.nn.functional import cross_entropy
 
-from presight_core.classes import UNKNOWN
+from presight_core.synthetic.lighting import KINDS
 
 MEAN, STD = (0.45, 0.45, 0.45), (0.25, 0.25, 0.25)  # of street pictures, roughly; batch normalisation does the rest
 OUTPUTS = {  # name of the output, input pixels a cell, channels
@@ -44,56 +44,76 @@ OUTPUTS = {  # name of the output, input pixels a cell, channels
 
 
 @dataclass(frozen=True)
+class Course:
+    """One rise and fall of the learning rate."""
+
+    steps: int
+    coarse_share: float  # of the steps, the first ones, see images at half scale: the same learned in half the time
+    learning_rate: float  # at its highest
+    class_weight_power: float  # 0: every pixel counts alike; 1: every class
+
+
+@dataclass(frozen=True)
 class Recipe:
     """One training; the defaults are the shipped pair's."""
 
-    steps: int = 4500
-    rigs: int = 200  # six images each
-    unseen_rigs: int = 30
+    # The second course weighs rare classes more: after the first, poles and riders are hardly ever predicted.
+    courses: tuple[Course, ...] = (Course(2400, 0.5, 5e-3, 0.25), Course(2200, 0.0, 4e-3, 0.4))
+    rigs: int = 300  # six images each
+    unseen_rigs: int = 48
     batch_size: int = 4  # many small steps beat few large ones in a training of minutes
-    coarse_share: float = 0.65  # of the steps see images at half scale: the same learned in half the time
-    learning_rate: float = 5e-3
-    class_weight_power: float = 0.4  # 0: every pixel counts alike; 1: every class
+    rare_share: float = 0.5  # of the crops are taken around a class that fills little of the images
+    overlap_loss_weight: float = 0.5  # this and the share above were set once, not tuned
     feature_loss_weight: float = 0.4
     seed: int = 0
     threads: int = 1
 
+    @property
+    def steps(self) -> int:
+        return sum(course.steps for course in self.courses)
 
-def train(views: LabelledImages, recipe: Recipe, report: Callable[[int, float], None]) -> TinyNetwork:
-    """A network trained on labelled images; `report(step, loss)` is called at every step."""
+
+def train(views: LabelledImages, recipe: Recipe, report: Callable[[float], None]) -> TinyNetwork:
+    """A network trained on labelled images; `report(loss)` is called at every step."""
     torch.manual_seed(recipe.seed)
     torch.set_num_threads(recipe.threads)
-    rng = np.random.default_rng(recipe.seed)
     network = TinyNetwork()
-    weights = class_weights(views.labels, recipe.class_weight_power)
-    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=0.02)
+    network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - torch's stubs do not know it
+    for number in range(len(recipe.courses)):
+        take_course(network, views, recipe, number, report)
+    return network.eval()
+
+
+def take_course(
+    network: TinyNetwork, views: LabelledImages, recipe: Recipe, number: int, report: Callable[[float], None]
+) -> None:
+    """Train a network further, by one of the recipe's courses."""
+    course, rng = recipe.courses[number], np.random.default_rng([recipe.seed, number])
+    weights = class_weights(views.labels, course.class_weight_power)
+    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=0.02, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, recipe.learning_rate, total_steps=recipe.steps, pct_start=0.15
+        optimizer, course.learning_rate, total_steps=course.steps, pct_start=0.15
     )
-    for step, (images, labels) in enumerate(_batches(views, recipe, rng), 1):
+    for images, labels in _batches(views, recipe, course, rng):
         logits, features = network(images)
-        loss = _loss(logits, labels, weights, rng)
-        loss = loss + recipe.feature_loss_weight * _loss(network.feature_classifier(features), labels, weights, rng)
+        loss = segmentation_loss(logits, labels, weights, rng, recipe.overlap_loss_weight)
+        patches = network.feature_classifier(features)
+        loss = loss + recipe.feature_loss_weight * segmentation_loss(patches, labels, weights, rng)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
-        report(step, loss.item())
-    return network.eval()
+        report(loss.item())
 
 
-def class_weights(labels: NDArray[np.uint8], power: float) -> Tensor:
-    """Weights (19,) of the classes' losses, frequency to the power of -`power`, 1 on average over pixels."""
-    frequency = np.bincount(labels.ravel(), minlength=UNKNOWN + 1)[:CLASS_COUNT] / labels.size
-    weights = np.maximum(frequency, 5e-4) ** -power  # the floor: a class of a few pixels must not rule the rest
-    return torch.tensor(weights / (weights * frequency).sum(), dtype=torch.float32)
-
-
-def _batches(views: LabelledImages, recipe: Recipe, rng: np.random.Generator) -> Iterator[tuple[Tensor, Tensor]]:
-    for step in range(recipe.steps):
-        size_px = COARSE_CROP_PX if step < recipe.coarse_share * recipe.steps else WHOLE_CROP_PX
-        chosen = rng.integers(len(views.rgb), size=recipe.batch_size)
-        crops = [random_crop(views.rgb[k], views.labels[k], size_px, rng) for k in chosen]
+def _batches(
+    views: LabelledImages, recipe: Recipe, course: Course, rng: np.random.Generator
+) -> Iterator[tuple[Tensor, Tensor]]:
+    finder = Finder(views.labels, recipe.rare_share, rng)
+    for step in range(course.steps):
+        size_px = COARSE_CROP_PX if step < course.coarse_share * course.steps else WHOLE_CROP_PX
+        places = [finder.place() for _ in range(recipe.batch_size)]
+        crops = [random_crop(views.rgb[k], views.labels[k], size_px, rng, focus) for k, focus in places]
         images = np.stack([another_camera(rgb, rng) for rgb, _ in crops])
         labels = np.stack([labels for _, labels in crops]).astype(np.int64)
         yield _network_input(images), torch.from_numpy(labels)
@@ -105,27 +125,20 @@ def _network_input(images: NDArray[np.float32]) -> Tensor:
     return torch.from_numpy(normalised).permute(0, 3, 1, 2)
 
 
-def _loss(logits: Tensor, labels: Tensor, weights: Tensor, rng: np.random.Generator) -> Tensor:
-    """Cross-entropy of every cell with one of its pixels, another at each step: on average with all of them."""
-    stride = labels.shape[-1] // logits.shape[-1]
-    row, column = rng.integers(stride, size=2)
-    return cross_entropy(logits, labels[:, row::stride, column::stride], weights, ignore_index=UNKNOWN)
-
-
 def measure(network: TinyNetwork, views: LabelledImages) -> Scores:
     """Scores on images in the order of their cities."""
     size = INPUT_WIDTH_PX, INPUT_HEIGHT_PX
     labels = np.stack([cv2.resize(each, size, interpolation=cv2.INTER_NEAREST) for each in views.labels])
-    matrix = np.zeros((CLASS_COUNT, CLASS_COUNT), np.int64)
+    by_light = {KINDS[k]: np.zeros((CLASS_COUNT, CLASS_COUNT), np.int64) for k in np.unique(views.lights)}
     features = []
-    for rgb, truth in zip(views.rgb, labels, strict=True):
+    for rgb, truth, light in zip(views.rgb, labels, views.lights, strict=True):
         image = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         with torch.inference_mode():
             logits, feature = network(_network_input(image[None]))
-        matrix += confusion(logits.argmax(1)[0].numpy().astype(np.uint8), truth)
+        by_light[KINDS[light]] += confusion(logits.argmax(1)[0].numpy().astype(np.uint8), truth)
         features.append(feature[0].numpy())
     neighbours = neighbour_accuracy(np.stack(features), labels, np.random.default_rng(0))
-    return scores(matrix, neighbours)
+    return scores(by_light, neighbours)
 
 
 def write_models(network: TinyNetwork, note: str, folder: Path) -> None:
@@ -175,16 +188,17 @@ def rendered(parts: Iterator[LabelledImages], total: int, what: str, kept: Path 
     """All views in one, with a line of progress; `kept` is a file that holds them from an earlier run, or will."""
     if kept and kept.is_file():
         with np.load(kept) as arrays:
-            return LabelledImages(arrays["rgb"], arrays["labels"])
+            return LabelledImages(**arrays)
     started, views = time.process_time(), []
     for done, part in enumerate(parts, 1):
         views.append(part)
         print(f"\r{what}: {done} of {total} rigs, {time.process_time() - started:.0f} CPU s", end="", flush=True)
     print()
-    whole = LabelledImages(np.concatenate([v.rgb for v in views]), np.concatenate([v.labels for v in views]))
+    columns = {name: np.concatenate([getattr(part, name) for part in views]) for name in ("rgb", "labels", "lights")}
+    whole = LabelledImages(**columns)
     if kept:
         kept.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(kept, rgb=whole.rgb, labels=whole.labels)
+        np.savez(kept, rgb=whole.rgb, labels=whole.labels, lights=whole.lights)
     return whole
 
 
@@ -192,32 +206,34 @@ class _Progress:
     """Prints the running mean of the loss now and then."""
 
     def __init__(self, steps: int):
-        self._steps, self._started, self._mean = steps, time.process_time(), 0.0
+        self._steps, self._started, self._step, self._mean = steps, time.process_time(), 0, 0.0
 
-    def __call__(self, step: int, loss: float) -> None:
-        keep = min(0.98, 1 - 1 / step)  # the mean of the last 50 steps or so
+    def __call__(self, loss: float) -> None:
+        self._step += 1
+        keep = min(0.98, 1 - 1 / self._step)  # the mean of the last 50 steps or so
         self._mean = keep * self._mean + (1 - keep) * loss
-        if step % 20 == 0 or step == self._steps:
-            cpu_s = time.process_time() - self._started
-            print(f"\rtraining: {step} of {self._steps}, loss {self._mean:.3f}, {cpu_s:.0f} CPU s", end="", flush=True)
-        if step == self._steps:
+        if self._step % 20 == 0 or self._step == self._steps:
+            done = f"{self._step} of {self._steps}, loss {self._mean:.3f}"
+            print(f"\rtraining: {done}, {time.process_time() - self._started:.0f} CPU s", end="", flush=True)
+        if self._step == self._steps:
             print()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Train the tiny segmentation and feature networks.")
-    parser.add_argument("--steps", type=int, default=Recipe.steps)
     parser.add_argument("--rigs", type=int, default=Recipe.rigs, help="places to render for training, six images each")
     parser.add_argument("--unseen-rigs", type=int, default=Recipe.unseen_rigs, help="places to render for measuring")
     parser.add_argument("--seed", type=int, default=Recipe.seed)
     parser.add_argument("--threads", type=int, default=Recipe.threads)
+    parser.add_argument("--haste", type=int, default=1, help="take this many times fewer steps, for a trial")
     parser.add_argument("--out", type=Path, default=Path("presight_core/models/tiny"), help="folder of the models")
     parser.add_argument(
         "--views", type=Path, help="folder that keeps the views for other runs; empty it when the city changes"
     )
     arguments = vars(parser.parse_args())
-    folder, kept = arguments.pop("out"), arguments.pop("views")
-    recipe = Recipe(**arguments)
+    folder, kept, haste = (arguments.pop(name) for name in ("out", "views", "haste"))
+    courses = tuple(replace(course, steps=max(course.steps // haste, 4)) for course in Recipe.courses)
+    recipe = Recipe(courses, **arguments)
     views = rendered(
         training_views(recipe.rigs, recipe.seed, recipe.threads),
         recipe.rigs,
@@ -233,6 +249,7 @@ def main() -> None:
     )
     measured = measure(network, unseen)
     print(measured.summary())
+    print(f"Share of the pixels: {measured.frequencies()}")
     write_models(network, card_note(measured, recipe.steps), folder)
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from presight_core.cameras import Camera
 from presight_core.synthetic.actors import Actor
@@ -20,6 +21,7 @@ class View:
     cameras: tuple[Camera, ...]  # six, in the order of rig.RIG
     lighting: Lighting
     actors: tuple[Actor, ...]
+    world_from_ego: NDArray[np.float64]  # (4, 4) of the car that carries the rig, for its head lights
 
 
 def random_view(city: City, rng: np.random.Generator, width_px: int = 400, light: str | None = None) -> View:
@@ -30,8 +32,10 @@ def random_view(city: City, rng: np.random.Generator, width_px: int = 400, light
     x, y, yaw = pose[0].tolist()
     traffic = plan_traffic(city, rng, pose, duration_s=0.0)
     kind = light or str(rng.choice(KINDS))
+    world_from_ego = city.terrain.stand(x, y, yaw)
     return View(
-        cameras=rig_cameras(city.terrain.stand(x, y, yaw), width_px, width_px * 9 // 16),
+        cameras=rig_cameras(world_from_ego, width_px, width_px * 9 // 16),
         lighting=sample_lighting(kind, rng),
         actors=tuple(traffic.actors(0.0, pose[0, :2])),
+        world_from_ego=world_from_ego,
     )

@@ -37,11 +37,6 @@ def views(city: City, view: View) -> Views:
     return Renderer(city).render(view.cameras, view.lighting, view.actors)
 
 
-def ego_of(view: View) -> np.ndarray:
-    """world_from_ego of a view's rig."""
-    return view.cameras[0].world_from_camera @ np.linalg.inv(RIG[0].ego_from_camera)
-
-
 def look_down(position: np.ndarray, focal_px: float) -> Camera:
     """A camera that looks straight down."""
     world_from_camera = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
@@ -150,7 +145,7 @@ def test_antialiasing_smooths_edges_and_keeps_the_brightness(city: City, view: V
 
 
 def test_a_night_is_the_same_bytes_in_any_number_of_threads(city: City, view: View):
-    night, ego = sample_lighting("night", np.random.default_rng(0)), ego_of(view)
+    night, ego = sample_lighting("night", np.random.default_rng(0)), view.world_from_ego
     renderer = Renderer(city)
     with ThreadPoolExecutor(3) as pool:
         runs = list(pool.map(lambda _: renderer.render(view.cameras, night, view.actors, ego=ego), range(3)))
@@ -184,14 +179,22 @@ def test_head_lights_light_the_road_ahead(city: City, view: View):
     night = sample_lighting("night", np.random.default_rng(0))
     renderer = Renderer(city)
     off = renderer.render(view.cameras[:1], night)
-    lit = renderer.render(view.cameras[:1], night, ego=ego_of(view))
+    lit = renderer.render(view.cameras[:1], night, ego=view.world_from_ego)
     road = (off.labels == CITYSCAPES.index("road")) & (off.depth_m > 4) & (off.depth_m < 15)
     assert lit.rgb[road].mean() > 1.2 * off.rgb[road].mean()
     np.testing.assert_array_equal(off.depth_m, lit.depth_m)
 
 
+def test_a_random_rig_stands_on_the_road_and_is_carried_by_its_ego(city: City, view: View):
+    x, y, z = view.world_from_ego[:3, 3]
+    assert abs(z - city.height_m(x, y)) < 1e-9
+    np.testing.assert_allclose(
+        view.cameras[0].world_from_camera, view.world_from_ego @ RIG[0].ego_from_camera, atol=1e-9
+    )
+
+
 def test_by_day_head_lights_change_nothing(city: City, view: View, views: Views):
-    lit = Renderer(city).render(view.cameras, view.lighting, view.actors, ego=ego_of(view))
+    lit = Renderer(city).render(view.cameras, view.lighting, view.actors, ego=view.world_from_ego)
     np.testing.assert_array_equal(lit.rgb, views.rgb)
 
 
