@@ -65,12 +65,14 @@ def outputs(predictions: torch.Tensor | LinePredictions) -> torch.Tensor:
     return predictions.lines[-1] if isinstance(predictions, LinePredictions) else predictions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_learns_one_batch_by_heart(name):
     losses = learn(tiny(name, BOTH), 25, 3e-3)
     assert np.mean(losses[-3:]) < losses[0] / 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampling", ["learned", "kernel"])
 def test_a_model_with_attention_to_images_learns_too(sampling):
     settings = BevFormerSettings((0.0, 1.5), heads=2, points=2, self_heads=2, feedforward=64, sampling=sampling)
@@ -78,6 +80,7 @@ def test_a_model_with_attention_to_images_learns_too(sampling):
     assert np.mean(losses[-3:]) < losses[0] / 3
 
 
+@pytest.mark.slow
 def test_training_is_the_same_twice():
     assert learn(tiny("map_tr", BOTH), 2, 1e-3) == learn(tiny("map_tr", BOTH), 2, 1e-3)
 
@@ -177,6 +180,7 @@ def test_without_pictures_a_full_model_sees_only_the_prior(name):
     torch.testing.assert_close(outputs(model(None, None, prior)), outputs(expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_without_cameras_learns_from_the_prior(name):
     """Table 7, setting b."""

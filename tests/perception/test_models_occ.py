@@ -40,6 +40,7 @@ def learn(model: OccupancyModel, step_count: int) -> list[float]:
     return losses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_learns_one_batch_by_heart(name):
     model = toy_occupancy.model(name, CAMERAS)
