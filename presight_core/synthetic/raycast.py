@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from presight_core.synthetic.mesh import Mesh
 
+BATCH = 2**18  # rays at once: what the library returns takes 40 bytes a ray
+
 
 class Hits(NamedTuple):
     """The nearest surface along each ray."""
@@ -58,11 +60,13 @@ class RayCaster:
         origins = np.ascontiguousarray(np.broadcast_to(np.asarray(origins, np.float32), directions.shape))
         distance_m = np.full(len(directions), np.inf, np.float32)
         faces = np.full(len(directions), -1, np.int32)
-        for first_face, scene in self._scenes if len(directions) else []:
-            found = scene.run(origins, directions, dists=distance_m, output=True)
-            nearer = found["primID"] >= 0
-            distance_m[nearer] = found["tfar"][nearer]
-            faces[nearer] = found["primID"][nearer] + first_face
+        for start in range(0, len(directions), BATCH):
+            part = slice(start, start + BATCH)
+            for first_face, scene in self._scenes:
+                found = scene.run(origins[part], directions[part], dists=distance_m[part], output=True)
+                nearer = found["primID"] >= 0
+                distance_m[part][nearer] = found["tfar"][nearer]
+                faces[part][nearer] = found["primID"][nearer] + first_face
         return Hits(distance_m, faces)
 
     def look(self, origin: ArrayLike, directions: ArrayLike) -> Rays:
