@@ -24,9 +24,8 @@ def generate_city(out: Path, name: str, seed: int, overrides: list[str]) -> None
     preset = load_preset(name, overrides)
     with progress_bars() as report:
         write_dataset(out, preset, seed, report)
-    print(
-        f"{out}: {', '.join(preset.towns)} in nuScenes format; next: presight ingest {out} --version {preset.version}"
-    )
+    print(f"{out}: {', '.join(preset.towns)} in nuScenes format, all at a glance in {out / 'contact_sheet.png'}")
+    print(f"next: presight ingest {out} --version {preset.version}")
 
 
 def run_demo(folder: Path, overrides: list[str]) -> None:
