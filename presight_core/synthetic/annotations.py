@@ -37,8 +37,7 @@ class Sightings:
 
 def sightings_of_image(actors: Sequence[Actor], camera: Camera, instances: NDArray[np.int32]) -> Sightings:
     """Of the actors in front of a camera, given the instance (H, W) of each of its pixels."""
-    numbers, counts = np.unique(instances, return_counts=True)
-    seen = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
+    seen = _counted(instances)
     image = shapely.box(0, 0, camera.width_px, camera.height_px)
     sightings = Sightings()
     for actor in actors:
@@ -47,15 +46,19 @@ def sightings_of_image(actors: Sequence[Actor], camera: Camera, instances: NDArr
             outline = shapely.MultiPoint(projected).convex_hull
             filled = round(0.65 * outline.intersection(image).area)  # a car fills about two thirds of its outline
             if filled > 1:
-                sightings.seen_px[actor.instance] += seen.get(actor.instance, 0)
+                sightings.seen_px[actor.instance] += seen[actor.instance]
                 sightings.expected_px[actor.instance] += filled
     return sightings
 
 
 def sightings_of_sweep(instances: NDArray[np.int32]) -> Sightings:
     """Of a lidar's points (N,), by the instance that each hit."""
+    return Sightings(lidar_points=_counted(instances))
+
+
+def _counted(instances: NDArray[np.int32]) -> Counter[int]:
     numbers, counts = np.unique(instances, return_counts=True)
-    return Sightings(lidar_points=Counter(dict(zip(numbers.tolist(), counts.tolist(), strict=True))))
+    return Counter(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
 
 
 def boxes_of(plan: DrivePlan, keyframe: int, sightings: Sightings) -> list[Box]:

@@ -44,7 +44,8 @@ def draw_contact_sheet(root: Path, preset: SynthPreset) -> Path:
     for order in preset.drives:
         if (order.location, order.light) not in shown:
             shown.add((order.location, order.light))
-            images = [_Moment(root, preset, order).image(channel) for channel in AROUND]
+            moment = _Moment(root, preset, order)  # once: it keeps the drive's rows
+            images = [moment.image(channel) for channel in AROUND]
             rows.extend(_titled(f"{order.scene}, {order.location}, {order.light}", images, ROW_PX))
     first = _Moment(root, preset, preset.drives[0])
     rows.extend(_titled(f"{first.order.scene}, ground truth: depth, classes, objects", first.truth(), ROW_PX))
@@ -65,7 +66,7 @@ class _Moment:
 
     @cached_property
     def _rows(self) -> dict[str, list[dict[str, Any]]]:
-        return json.loads((self.root / "synth_gt" / self.order.scene / "rows.json").read_text(encoding="utf-8"))
+        return json.loads((self.root / nuscenes.rows_path(self.order.scene)).read_text(encoding="utf-8"))
 
     @cached_property
     def _sample(self) -> dict[str, Any]:

@@ -95,10 +95,6 @@ def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
     return [line for key in keys for line in _differences(found.get(key), wanted.get(key), f"{prefix}{key}")]
 
 
-def _rows_file(root: Path, scene: str) -> Path:
-    return root / "synth_gt" / scene / "rows.json"
-
-
 @dataclass
 class _TownWork:
     """One city of a data set in the making; it is built only if something is left to do."""
@@ -127,7 +123,7 @@ class _TownWork:
         return CitySurfaces(self.city)
 
     def is_complete(self, order: DriveOrder) -> bool:
-        return _rows_file(self.root, order.scene).exists()
+        return (self.root / nuscenes.rows_path(order.scene)).exists()
 
     def write_drive(self, order: DriveOrder, tell: Callable[[int], None]) -> None:
         """Take everything of a drive side by side, then write its rows."""
@@ -140,7 +136,7 @@ class _TownWork:
             (self.root / path).parent.mkdir(parents=True, exist_ok=True)
         sightings = self._take(plan, shots, turns, tell)
         boxes = {keyframe: boxes_of(plan, keyframe, sightings[keyframe]) for keyframe in range(plan.keyframes)}
-        write_json(_rows_file(self.root, order.scene), nuscenes.drive_rows(plan, files, size_px, boxes))
+        write_json(self.root / nuscenes.rows_path(order.scene), nuscenes.drive_rows(plan, files, size_px, boxes))
 
     def _take(
         self, plan: DrivePlan, shots: list[Shot], turns: list[Turn], tell: Callable[[int], None]
@@ -187,7 +183,7 @@ class _TownWork:
 def _write_tables(root: Path, preset: SynthPreset) -> None:
     """Join the rows of all drives into the tables."""
     drives: list[Rows] = [
-        json.loads(_rows_file(root, order.scene).read_text(encoding="utf-8")) for order in preset.drives
+        json.loads((root / nuscenes.rows_path(order.scene)).read_text(encoding="utf-8")) for order in preset.drives
     ]
     rows = nuscenes.merge([nuscenes.vocabulary_rows(preset.lidar), *drives])
     rows["map"] = [nuscenes.map_row(location, rows["log"]) for location in preset.towns]

@@ -21,6 +21,7 @@ from presight_core.synthetic.graph import (
 from presight_core.synthetic.street import Street
 from presight_core.synthetic.style import CityStyle
 
+BAY_LENGTH_M = 6.2  # of a parked car
 SNAP_M = 0.03  # curves lose vertices closer to a chord than this; far below a pixel
 
 
@@ -171,10 +172,9 @@ def _lay_parking(layers: StreetLayers, graph: StreetGraph, edge: Edge, side: int
     """Marks shaped like a T between the bays, and where cars stand. No line divides the bays from the lane."""
     street, border = graph.street(*edge), side * LANE_WIDTH_M
     turn_rad = 0.0 if side == graph.drive_side else np.pi
-    bay_m = 6.2
-    starts = np.arange(span_m[0] + 3, span_m[1] - bay_m, bay_m)
+    starts = np.arange(span_m[0] + 3, span_m[1] - BAY_LENGTH_M, BAY_LENGTH_M)
     for s in starts:
         layers.white_paint.append(Polygon(street.strip((s - 0.06, s + 0.06), (border, border + side * 1.0))))
         layers.white_paint.append(Polygon(street.strip((s - 0.45, s + 0.45), (border, border - side * 0.12))))
-        x, y = street.at(s + bay_m / 2, border + side * 1.15)
-        layers.parking.append((float(x), float(y), street.yaw_at(s + bay_m / 2) + turn_rad))
+        x, y = street.at(s + BAY_LENGTH_M / 2, border + side * 1.15)
+        layers.parking.append((float(x), float(y), street.yaw_at(s + BAY_LENGTH_M / 2) + turn_rad))

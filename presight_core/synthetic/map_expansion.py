@@ -13,14 +13,14 @@ from shapely.ops import substring, unary_union
 
 from presight_core.synthetic.arclines import fit_arcs, row_from_arc
 from presight_core.synthetic.city import City
+from presight_core.synthetic.files import write_json
 from presight_core.synthetic.graph import LANE_WIDTH_M, PARKING_WIDTH_M, Edge, StreetGraph
-from presight_core.synthetic.layers import SNAP_M, Lane, polygons
-from presight_core.synthetic.nuscenes import Row, Rows, token, write_json
+from presight_core.synthetic.layers import BAY_LENGTH_M, SNAP_M, Lane, polygons
+from presight_core.synthetic.nuscenes import Row, Rows, token
 
 VERSION = "1.3"
 NODE_GAP_M = 4.0  # readers look for lines in a region by their nodes, so no line may leap over one
 SEAM_M = 0.02  # how far a junction reaches into its streets: no slit remains that would look like a curb
-BAY_LENGTH_M = 6.2  # of a parked car
 TABLES = (
     "polygon", "line", "node", "drivable_area", "road_segment", "road_block", "lane", "ped_crossing", "walkway",
     "stop_line", "carpark_area", "road_divider", "lane_divider", "traffic_light", "lane_connector",
@@ -35,11 +35,6 @@ def write_map_expansion(path: Path, city: City) -> None:
 def map_expansion(city: City, location: str) -> dict[str, Any]:
     """All tables of the map; coordinates are world metres, rounded to millimetres."""
     return _MapBuilder(city, location).build()
-
-
-def lane_centre(lane: Lane) -> NDArray[np.float64]:
-    """The middle (N, 2) of a lane in its driving direction."""
-    return (lane.left + lane.right) / 2
 
 
 def turn_centre(graph: StreetGraph, path: tuple[int, int, int], lane: int, ends: NDArray) -> NDArray[np.float64]:
@@ -184,7 +179,7 @@ class _MapBuilder:
                 "right_lane_divider_segments": self._divider(lane.right),
             }
             self.tables["lane"].append(row)
-            self._add_path(row["token"], lane_centre(lane))
+            self._add_path(row["token"], lane.centre)
 
     def _edges(self, left: NDArray[np.float64], right: NDArray[np.float64]) -> Row:
         """The lines across the begin and the end of a lane or block."""
@@ -246,7 +241,7 @@ class _MapBuilder:
                     self._connect(path, number, lane_of(before, node, number), lane_of(node, after, number))
 
     def _connect(self, path: tuple[int, int, int], number: int, before: Lane, after: Lane) -> None:
-        ends = np.stack([lane_centre(before)[-1], lane_centre(after)[0]])
+        ends = np.stack([before.centre[-1], after.centre[0]])
         centre = turn_centre(self.graph, path, number, ends)
         ribbon = LineString(centre).buffer(LANE_WIDTH_M / 2, cap_style="flat").simplify(SNAP_M)
         surface = max(polygons(ribbon), key=lambda part: part.area)  # a tight bend may shed a crumb
@@ -298,7 +293,7 @@ class _MapBuilder:
     def _light(self, name: str, block: str, stop_line: Polygon, lane: Lane) -> Row:
         """The lamp over the lane: beside the stop line stands a mast whose arm reaches back over it."""
         middle = np.array(stop_line.centroid.coords[0])
-        centre = lane_centre(lane)
+        centre = lane.centre
         step = int(np.linalg.norm(centre[:-1] + centre[1:] - 2 * middle, axis=1).argmin())  # the stretch beside it
         heading = (centre[step + 1] - centre[step]) / np.linalg.norm(centre[step + 1] - centre[step])
         outward = self.graph.drive_side * np.array([-heading[1], heading[0]])

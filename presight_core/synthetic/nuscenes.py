@@ -85,6 +85,11 @@ def truth_path(plan: DrivePlan, shot: Shot) -> str:
     return f"synth_gt/{plan.name}/{shot.timestamp_us}_{shot.mount.channel}.npz"
 
 
+def rows_path(scene: str) -> str:
+    """Where the table rows of a drive go, relative to the data root."""
+    return f"synth_gt/{scene}/rows.json"
+
+
 def sweep_path(plan: DrivePlan, turn: Turn) -> str:
     """Where the lidar's points of a turn go, relative to the data root."""
     folder = "samples" if turn.is_keyframe else "sweeps"

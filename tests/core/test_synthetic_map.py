@@ -12,7 +12,7 @@ from shapely.ops import unary_union
 
 from presight_core.synthetic.arclines import Arc, fit_arcs, row_from_arc
 from presight_core.synthetic.city import City
-from presight_core.synthetic.map_expansion import NODE_GAP_M, TABLES, lane_centre, map_expansion, write_map_expansion
+from presight_core.synthetic.map_expansion import NODE_GAP_M, TABLES, map_expansion, write_map_expansion
 from presight_core.synthetic.style import CityStyle
 
 BLOCK = CityStyle(size_m=200.0, spacing_m=90.0)  # four nodes: bends only
@@ -212,7 +212,7 @@ def test_paths_end_where_they_say(tables: dict):
 def test_lane_paths_follow_the_middle_of_their_lane(city: City, tables: dict):
     for row, lane in zip(tables["lane"], city.layers.lanes, strict=True):
         poses = poses_of(tables["arcline_path_3"][row["token"]])
-        off_m = shapely.distance(LineString(lane_centre(lane)), shapely.points(poses[:, :2]))
+        off_m = shapely.distance(LineString(lane.centre), shapely.points(poses[:, :2]))
         assert off_m.max() < 0.1
 
 

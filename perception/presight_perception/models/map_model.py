@@ -5,12 +5,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
-import numpy as np
 from torch import Tensor, nn
 
 from presight_perception.dataset import PriorBatch
 from presight_perception.map_truth import MapLines
-from presight_perception.metrics import ScoredLines
 from presight_perception.models.bev_features import BevFeatures, BevSettings
 from presight_perception.models.camera_rig import CameraRig
 
@@ -49,9 +47,3 @@ class MapModel(nn.Module, ABC, Generic[Predictions, Truth]):
 def rare_class_bias(layer: nn.Linear) -> None:
     """Let a classifier begin with a probability of 0.01 for each class, as focal losses want it."""
     nn.init.constant_(layer.bias, -math.log((1 - 0.01) / 0.01))
-
-
-def scored_lines(lines_m: Tensor, labels: Tensor, scores: Tensor) -> ScoredLines:
-    """Lines (N, points, 2) with labels and scores (N,) as the metric takes them."""
-    lines, label_array, score_array = (part.detach().cpu().numpy() for part in (lines_m, labels, scores))
-    return ScoredLines(list(lines.astype(np.float64)), label_array, score_array)

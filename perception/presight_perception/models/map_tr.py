@@ -1,20 +1,20 @@
 """MapTR (Liao et al., 2023): queries of lines and of points, and a box for neither."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
 
-from presight_perception.map_truth import MAP_CLASSES, MapLines
+from presight_perception.map_truth import MAP_CLASSES
 from presight_perception.metrics import ScoredLines
 from presight_perception.models.attention import AttentionSettings, DecoderLayer
 from presight_perception.models.backbone import ImageEncoderSettings, ResNetSettings
 from presight_perception.models.bev_features import TINY_GRID, BevSettings, Sources
 from presight_perception.models.bev_grid import BevGrid
-from presight_perception.models.line_loss import LineLossSettings, LinePredictions, line_losses
-from presight_perception.models.line_truth import LineSettings, LineTruth, line_truth
-from presight_perception.models.map_model import MapModel, rare_class_bias, scored_lines
+from presight_perception.models.line_loss import LineLossSettings, LinePredictions
+from presight_perception.models.line_model import LineModel, scored_lines
+from presight_perception.models.line_truth import LineSettings
+from presight_perception.models.map_model import rare_class_bias
 from presight_perception.models.view_transform import BevFormerSettings
 
 PAPER_IMAGES = ImageEncoderSettings(ResNetSettings(50, stages=(4,), frozen_stages=1, norm_eval=True, norm_learns=False))
@@ -53,12 +53,13 @@ class MapTrSettings:
         return MapTrSettings(bev, 20, 2, 4, 4, 128, LineSettings(10, "vertices"), PAPER_LOSS, 30)
 
 
-class MapTr(MapModel[LinePredictions, LineTruth]):
+class MapTr(LineModel):
     """Each of a line's points is a query: the sum of a line's and a point's embedding."""
 
     def __init__(self, settings: MapTrSettings | None = None) -> None:
-        self.settings = settings = settings or MapTrSettings()
-        super().__init__(settings.bev)
+        settings = settings or MapTrSettings()
+        super().__init__(settings.bev, settings.lines, settings.loss)
+        self.settings = settings
         channels, layers = settings.bev.channels, range(settings.layer_count)
         self.line_query = nn.Embedding(settings.line_count, 2 * channels)
         self.point_query = nn.Embedding(settings.lines.point_count, 2 * channels)
@@ -82,12 +83,6 @@ class MapTr(MapModel[LinePredictions, LineTruth]):
             lines.append(moved.unflatten(1, by_line))
             place = moved.detach()
         return LinePredictions(torch.stack(logits), torch.stack(lines))
-
-    def truth_of(self, lines: MapLines) -> LineTruth:
-        return line_truth(lines, self.settings.bev.grid, self.settings.lines)
-
-    def loss(self, predictions: LinePredictions, truths: Sequence[LineTruth]) -> dict[str, Tensor]:
-        return line_losses(predictions, truths, self.settings.bev.grid, self.settings.loss)
 
     @torch.no_grad()
     def decode(self, predictions: LinePredictions) -> list[ScoredLines]:

@@ -1,19 +1,19 @@
 """StreamMapNet (Yuan et al., 2024) without its streaming: the paper uses no history for mapping."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
 
-from presight_perception.map_truth import MAP_CLASSES, MapLines
+from presight_perception.map_truth import MAP_CLASSES
 from presight_perception.metrics import ScoredLines
 from presight_perception.models.attention import AttentionSettings, DecoderLayer, initialise_linear, sine_positions
 from presight_perception.models.bev_features import TINY_GRID, BevSettings, Sources
 from presight_perception.models.bev_grid import BevGrid
-from presight_perception.models.line_loss import LineLossSettings, LinePredictions, line_losses
-from presight_perception.models.line_truth import LineSettings, LineTruth, line_truth
-from presight_perception.models.map_model import MapModel, rare_class_bias, scored_lines
+from presight_perception.models.line_loss import LineLossSettings, LinePredictions
+from presight_perception.models.line_model import LineModel, scored_lines
+from presight_perception.models.line_truth import LineSettings
+from presight_perception.models.map_model import rare_class_bias
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,15 @@ class StreamMapNetSettings:
         return StreamMapNetSettings(bev, 64, 30, 2, 4, 128, 128, LineSettings(10), LineLossSettings(5.0, 5.0))
 
 
-class StreamMapNet(MapModel[LinePredictions, LineTruth]):
+class StreamMapNet(LineModel):
     """Each query draws one line, and looks into the bird's-eye view around all points of that line."""
 
     positions: Tensor
 
     def __init__(self, settings: StreamMapNetSettings | None = None) -> None:
-        self.settings = settings = settings or StreamMapNetSettings()
-        super().__init__(settings.bev)
+        settings = settings or StreamMapNetSettings()
+        super().__init__(settings.bev, settings.lines, settings.loss)
+        self.settings = settings
         channels, points, grid = settings.channels, settings.lines.point_count, settings.bev.grid
         self.input = nn.Conv2d(settings.bev.channels, channels, 1)
         self.register_buffer("positions", sine_positions(grid.rows, grid.columns, channels), persistent=False)
@@ -75,12 +76,6 @@ class StreamMapNet(MapModel[LinePredictions, LineTruth]):
             logits.append(self.classify(query))
             line = lines[-1].detach()
         return LinePredictions(torch.stack(logits), torch.stack(lines))
-
-    def truth_of(self, lines: MapLines) -> LineTruth:
-        return line_truth(lines, self.settings.bev.grid, self.settings.lines)
-
-    def loss(self, predictions: LinePredictions, truths: Sequence[LineTruth]) -> dict[str, Tensor]:
-        return line_losses(predictions, truths, self.settings.bev.grid, self.settings.loss)
 
     @torch.no_grad()
     def decode(self, predictions: LinePredictions) -> list[ScoredLines]:
