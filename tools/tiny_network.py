@@ -45,7 +45,10 @@ class TinyNetwork(nn.Module):
         self.to_features = nn.Conv2d(FEATURE_CHANNELS, FEATURE_CHANNELS, 1)
         self.from_features = nn.Conv2d(FEATURE_CHANNELS, 32, 1)
         self.refine_4 = _convolve(32, 32)
-        self.to_quarters = nn.Conv2d(32, 4 * 16, 1)  # the four cells of stride 2 within one of stride 4
+        # Both give the four cells of stride 2 within one of stride 4; the second spares the classes the way through
+        # sixteen channels.
+        self.to_quarters = nn.Conv2d(32, 4 * 16, 1)
+        self.to_coarse_logits = nn.Conv2d(32, 4 * CLASS_COUNT, 1)
         self.refine_2 = _convolve(16, 16)
         self.to_logits = nn.Conv2d(16, CLASS_COUNT, 1)
         self.feature_classifier = nn.Conv2d(FEATURE_CHANNELS, CLASS_COUNT, 1)  # for training only
@@ -63,7 +66,7 @@ class TinyNetwork(nn.Module):
         features = torch.tanh(self.to_features(deep))
         fine = self.refine_4(relu(self.from_stride_4(at_4) + _enlarged(self.from_features(features), at_4)))
         finest = self.refine_2(relu(self.from_stride_2(at_2) + pixel_shuffle(self.to_quarters(fine), 2)))
-        return self.to_logits(finest), features
+        return self.to_logits(finest) + pixel_shuffle(self.to_coarse_logits(fine), 2), features
 
 
 class _Residual(nn.Module):

@@ -24,6 +24,9 @@ RIGS_PER_CITY = {"training": 6, "unseen": 4}  # a city costs as much as three ri
 FIRST_UNSEEN_SEED = 1_000_000  # cities from here on are for measuring only
 LARGE = {"truck": 0.4, "bus": 0.4, "trailer": 0.1, "digger": 0.1}  # what some cars become, and how often
 LARGE_SHARE = 0.08  # of the cars; more, and cars are taken for buses
+BESIDE = {"bus": 0.6, "truck": 0.25, "trailer": 0.15}  # what some rigs have right beside them
+BESIDE_SHARE = 0.3  # of the rigs: a bus that fills a picture is its only bus, and ordinary traffic hardly shows it
+BESIDE_M = 3.2, 5.0  # across, from the middle of the car
 NEAR = {
     "pedestrian": 0.45, "child": 0.1, "worker": 0.05, "cyclist": 0.15, "motorcyclist": 0.1, "bicycle": 0.1,
     "motorcycle": 0.05,
@@ -131,6 +134,8 @@ def _busier(city: City, view: View, rng: np.random.Generator) -> tuple[Actor, ..
         else actor
         for actor in view.actors
     ]
+    if rng.random() < BESIDE_SHARE:
+        actors.append(_vehicle_beside(city, view, rng))
     x_m, y_m = _places_nearby(city, view.world_from_ego[:2, 3], rng)
     grounds_m = city.surface_m(x_m, y_m)
     for k in range(len(x_m)):
@@ -146,6 +151,21 @@ def _busier(city: City, view: View, rng: np.random.Generator) -> tuple[Actor, ..
             )
         )
     return tuple(actors)
+
+
+def _vehicle_beside(city: City, view: View, rng: np.random.Generator) -> Actor:
+    """A large vehicle in the next lane or at the kerb, along the way or against it."""
+    ego, side, nearest_m, farthest_m = view.world_from_ego, rng.choice([-1, 1]), *BESIDE_M
+    x_m, y_m = (ego @ [rng.uniform(-12, 12), side * rng.uniform(nearest_m, farthest_m), 0, 1])[:2]
+    return Actor(
+        kind=_one_of(BESIDE, rng),
+        x_m=float(x_m),
+        y_m=float(y_m),
+        ground_m=float(city.surface_m([x_m], [y_m])[0]),
+        yaw_rad=float(np.arctan2(ego[1, 0], ego[0, 0]) + rng.normal(0, 0.1) + np.pi * rng.integers(2)),
+        colour=tuple(rng.uniform(0.03, 0.7, 3).tolist()),
+        instance=FIRST_ACTOR + EXTRA_INSTANCE - 1,
+    )
 
 
 def _places_nearby(

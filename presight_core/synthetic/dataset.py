@@ -25,6 +25,7 @@ from presight_core.progress import Progress, Report, silent
 from presight_core.synthetic import nuscenes
 from presight_core.synthetic.annotations import Sightings, boxes_of
 from presight_core.synthetic.city import City
+from presight_core.synthetic.compile_ahead import ShaderAhead
 from presight_core.synthetic.contact_sheet import draw_contact_sheet
 from presight_core.synthetic.drive_plan import DrivePlan, Shot, Stretch, Turn, plan_drive, plan_streets
 from presight_core.synthetic.files import write_json
@@ -53,6 +54,7 @@ def write_dataset(
     """
     preset = load_preset(preset) if isinstance(preset, str) else preset
     _claim(root, preset, seed)
+    shade = ShaderAhead()
     total = len(preset.drives) * preset.moments
     done = 0
 
@@ -60,7 +62,7 @@ def write_dataset(
         report(Progress("synth", done + moments, total))
 
     for location in preset.towns:
-        town = _TownWork(root, preset, location, seed, threads or os.cpu_count() or 1)
+        town = _TownWork(root, preset, location, seed, shade, threads or os.cpu_count() or 1)
         for order in (order for order in preset.drives if order.location == location):
             if not town.is_complete(order):
                 town.write_drive(order, tell)
@@ -103,6 +105,7 @@ class _TownWork:
     preset: SynthPreset
     location: Location
     seed: int
+    shade: ShaderAhead
     threads: int
 
     @cached_property
@@ -116,7 +119,7 @@ class _TownWork:
 
     @cached_property
     def renderer(self) -> Renderer:
-        return Renderer(self.city, self.preset.antialias)
+        return Renderer(self.city, self.preset.antialias, self.shade)
 
     @cached_property
     def surfaces(self) -> CitySurfaces:

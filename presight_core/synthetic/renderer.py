@@ -1,6 +1,6 @@
 """Pictures of a city with exact depth, labels and instances. CPU only, no randomness but the seeds given."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,11 +42,13 @@ class Renderer:
     views = Renderer(city).render(view.cameras, view.lighting, view.actors)
 
     Antialiasing weighs nine samples a pixel, and costs about half the speed; ground truth is the same without it.
+    `shade`: `shade_view`, or what stands for it until it is compiled.
     """
 
-    def __init__(self, city: City, antialias: bool = True):
+    def __init__(self, city: City, antialias: bool = True, shade: Callable[..., None] = shade_view):
         self.city = city
         self.antialias = antialias
+        self._shade = shade
         self._lamps = lamp_grid(city.lamps)
 
     def cast_shadows(self, lighting: Lighting, centre: ArrayLike, radius_m: float = 130.0) -> Shadows:
@@ -93,7 +95,7 @@ class Renderer:
         if len(scene.actors.faces):
             draw_perspective(scene.actors, view, len(scene.city.faces), nearness, faces)
         exposure = np.empty((height, width, 3), np.float32)
-        shade_view(scene, view, self.antialias, nearness, faces, exposure)
+        self._shade(scene, view, self.antialias, nearness, faces, exposure)
         rgb = develop(exposure, scene.lighting, seed)
         centres = np.s_[1::2, 1::2] if self.antialias else np.s_[:, :]
         return rgb, *ground_truth(scene.city, scene.actors, nearness[centres], faces[centres])

@@ -10,12 +10,14 @@ from presight_core.classes import CITYSCAPES, SKY
 from presight_core.frames import planar_transform
 from presight_core.synthetic.actors import FIRST_ACTOR, Actor
 from presight_core.synthetic.city import City
+from presight_core.synthetic.compile_ahead import compile_shader
 from presight_core.synthetic.graph import follow
 from presight_core.synthetic.lamps import Lamps, driving, lamp_grid, street_light
 from presight_core.synthetic.lighting import KINDS, sample_lighting
 from presight_core.synthetic.renderer import Renderer, Views
 from presight_core.synthetic.rig import RIG, rig_cameras
 from presight_core.synthetic.sensor import develop
+from presight_core.synthetic.shade import shade_view
 from presight_core.synthetic.style import CityStyle
 from presight_core.synthetic.views import View, random_view
 
@@ -252,3 +254,9 @@ def test_the_rig_looks_all_around():
     headings = [np.arctan2(*(m.ego_from_camera[:2, 2][::-1])) for m in RIG]
     gaps = np.diff(np.sort(np.rad2deg(headings)), append=np.rad2deg(min(headings)) + 360)
     assert gaps.max() < 75  # the rear camera alone sees 89 degrees
+
+
+def test_the_shader_compiled_ahead_is_the_one_that_views_need(view: View, city: City) -> None:
+    compile_shader()
+    Renderer(city).render(view.cameras, view.lighting, view.actors)
+    assert len(shade_view.signatures) == 1  # types that differ anywhere would have compiled it twice
