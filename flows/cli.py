@@ -43,6 +43,13 @@ def ingest(
     context: typer.Context,
     root: Annotated[Path, typer.Argument(help="Root of a data set in nuScenes format.", show_default=False)],
     version: Annotated[str, typer.Option(help="Folder of its tables, for example v1.0-trainval.")] = "v1.0-trainval",
+    scene: Annotated[
+        list[str] | None, typer.Option(help="Only scenes of this name or pattern, scene-00*; may be given again.")
+    ] = None,
+    tests: Annotated[
+        bool, typer.Option(help="Take the test scenes of the paper's split, too; priors must not see them.")
+    ] = True,
+    nights: Annotated[bool, typer.Option(help="Take scenes that say night, too; the paper's priors do not.")] = True,
     keep_going: Annotated[
         bool, typer.Option("--keep-going", help="Ingest the good frames of drives that have bad ones.")
     ] = False,
@@ -50,8 +57,10 @@ def ingest(
 ) -> None:
     """Check and index the drives of a data set. Ingesting the same content again changes nothing."""
     from flows.ingest import ingest_root
+    from stages.scene_choice import SceneChoice
 
-    ingest_root(context.obj, root, version, keep_going, as_json)
+    choice = SceneChoice(tuple(scene or ()), tests, nights)
+    ingest_root(context.obj, root, version, keep_going, as_json, choice)
 
 
 @app.command()

@@ -8,19 +8,27 @@ from flows.console import print_json, progress_bars
 from presight_core.drives import Reject
 from presight_core.errors import InputError
 from stages.ingest import IngestedDrive, ingest_nuscenes
+from stages.scene_choice import SceneChoice
 from storage.workspace import Workspace
 
 SHOWN_REJECTS = 20  # on the terminal; --json has them all
 
 
-def ingest_root(folder: Path, root: Path, version: str, keep_going: bool, as_json: bool) -> None:
-    """Ingest a data set and print what became of each drive.
+def ingest_root(
+    folder: Path,
+    root: Path,
+    version: str,
+    keep_going: bool,
+    as_json: bool,
+    choice: SceneChoice | None = None,
+) -> None:
+    """Ingest a data set, or the scenes of it that `choice` takes, and print what became of each drive.
 
     Raises InputError, with catalog and store unchanged, for tables that cannot be used, for bad frames unless
     `keep_going`, and where no drive has a good frame.
     """
     with progress_bars() as report:
-        drives = list(ingest_nuscenes(root, version, report))
+        drives = list(ingest_nuscenes(root, version, report, choice=choice))
     usable = _usable(drives, keep_going)
     workspace = Workspace.open(folder)
     catalog, index = workspace.catalog(), workspace.drives()

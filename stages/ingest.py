@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from presight_core import frames
 from presight_core.drives import Drive, FrameTable, Reject
+from presight_core.errors import InputError
 from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import DIGEST_LENGTH
 from stages.frame_faults import Faults, find_faults
 from stages.image_folder import ExpectedImage, ImageFolder, printable
 from stages.image_header import ImageFault
 from stages.nuscenes import Dataset, read_dataset
+from stages.scene_choice import SceneChoice
 
 LISTED_REJECTS = 20  # of one kind in one drive; the others are counted: a whole archive may be missing
 DIGEST_FORMAT = b"presight-drive-1"  # raise the number when what the digest covers changes
@@ -37,18 +39,35 @@ class IngestedDrive:
 
 
 def ingest_nuscenes(
-    root: Path, version: str, report: Report = silent, images: Literal["check", "trust"] = "check"
+    root: Path,
+    version: str,
+    report: Report = silent,
+    images: Literal["check", "trust"] = "check",
+    choice: SceneChoice | None = None,
 ) -> Iterator[IngestedDrive]:
     """The drives of a nuScenes-format data set, one a scene, in the order of its scene table.
 
     Every camera image is a frame, sweeps too, with the ego pose of its own timestamp. Image files are opened to
     compare their size with the table's and to see their end; `images="trust"` opens none (then `file_bytes` is 0).
-    Raises InputError, before the first drive, where the root or its tables are unusable (see `read_dataset`).
+    `choice` takes some of the scenes only. Raises InputError, before the first drive, where it takes none, and
+    where the root or its tables are unusable (see `read_dataset`).
     """
     root = Path(root)
     dataset = read_dataset(root, version, report)
     ingest = _Ingest(root.resolve(), version, dataset, find_faults(dataset))
-    return ingest.drives(images == "check", report)
+    return ingest.drives(_chosen(dataset, choice or SceneChoice()), images == "check", report)
+
+
+def _chosen(dataset: Dataset, choice: SceneChoice) -> list[int]:
+    """Rows of the scenes to ingest."""
+    chosen = [row for row, scene in enumerate(dataset.scenes) if choice.takes(scene)]
+    if not chosen:
+        names = sorted(scene.name for scene in dataset.scenes)
+        raise InputError(
+            f"{dataset.folder}/scene.json: no scene {choice}; "
+            f"its {len(names)} scenes are {names[0]} to {names[-1]}: choose among them"
+        )
+    return chosen
 
 
 @dataclass(frozen=True)
@@ -60,18 +79,18 @@ class _Ingest:
     dataset: Dataset
     faults: Faults
 
-    def drives(self, check_images: bool, report: Report) -> Iterator[IngestedDrive]:
+    def drives(self, scenes: list[int], check_images: bool, report: Report) -> Iterator[IngestedDrive]:
         scene_of_image = self.dataset.images.scene
         by_scene = np.argsort(scene_of_image, kind="stable")
         bounds = np.searchsorted(scene_of_image[by_scene], np.arange(len(self.dataset.scenes) + 1))
-        kept = 0
+        kept = seen = 0
         with ImageFolder(self.root) as folder:
-            for scene in range(len(self.dataset.scenes)):
+            for number, scene in enumerate(scenes, 1):
                 rows = by_scene[bounds[scene] : bounds[scene + 1]]
                 ingested = self._drive(scene, rows, folder if check_images else None)
-                kept += len(ingested.frames)
-                figures = {"frames": float(kept), "rejected": float(bounds[scene + 1] - kept)}
-                report(Progress("ingest", scene + 1, len(self.dataset.scenes), figures))
+                kept, seen = kept + len(ingested.frames), seen + len(rows)
+                figures = {"frames": float(kept), "rejected": float(seen - kept)}
+                report(Progress("ingest", number, len(scenes), figures))
                 yield ingested
 
     def _drive(self, scene: int, rows: NDArray[np.int64], folder: ImageFolder | None) -> IngestedDrive:

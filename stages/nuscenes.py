@@ -45,6 +45,7 @@ class SceneRow(msgspec.Struct):
     log_token: Token
     name: str
     first_sample_token: str
+    description: str = ""
 
 
 class SampleRow(msgspec.Struct):
@@ -103,6 +104,7 @@ class Scene:
     name: str
     city: str
     captured: str  # date, "2018-07-24"
+    description: str = ""  # free text; nights say so here
 
 
 @dataclass(frozen=True)
@@ -226,7 +228,7 @@ def _scenes(folder: Path, logs: list[LogRow], rows: list[SceneRow]) -> tuple[Sce
         _require_plain(folder / "scene.json", "name", row.name)
         if row.name in scenes:
             raise InputError(f"{folder}/scene.json: two scenes are named {row.name}; rename one")
-        scenes[row.name] = Scene(row.name, log.location, log.date_captured)
+        scenes[row.name] = Scene(row.name, log.location, log.date_captured, row.description)
     return tuple(scenes.values())
 
 

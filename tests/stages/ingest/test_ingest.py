@@ -12,8 +12,10 @@ from PIL import Image
 from presight_core import frames
 from presight_core.classes import CITYSCAPES, SKY
 from presight_core.drives import FrameTable
+from presight_core.errors import InputError
 from presight_core.progress import Progress
 from stages.ingest import ingest_nuscenes
+from stages.scene_choice import SceneChoice
 
 VERSION = "v1.0-mini"
 GROUND = [CITYSCAPES.index(name) for name in ("road", "sidewalk", "terrain")]
@@ -30,6 +32,25 @@ def test_every_scene_becomes_a_drive_and_every_camera_image_a_frame(tiny):
     assert len(first.frames) == first.drive.frame_count == 8  # two cameras, two keyframes, two sweeps
     assert first.rejects == ()
     assert first.frames.is_keyframe.sum() == 4
+
+
+def test_scenes_can_be_chosen_by_name_by_the_papers_split_and_by_the_dark(tiny):
+    tiny.tables["scene"][0] |= {"name": "scene-0001", "description": "Night, parked cars"}  # a test scene
+    tiny.tables["scene"][1] |= {"name": "scene-0002"}
+    root = tiny.write()
+
+    def names(**choice) -> list[str]:
+        return [each.drive.name for each in ingest_nuscenes(root, VERSION, choice=SceneChoice(**choice))]
+
+    assert names() == ["scene-0001", "scene-0002"]
+    assert names(names=("scene-00*1", "other")) == ["scene-0001"]
+    assert names(tests=False) == ["scene-0002"]
+    assert names(nights=False) == ["scene-0002"]
+
+
+def test_a_choice_of_no_scene_is_refused_with_what_there_is(tiny):
+    with pytest.raises(InputError, match=r"no scene named scene-1.*, not at night; its 2 scenes are scene-0000 to"):
+        ingest_nuscenes(tiny.write(), VERSION, choice=SceneChoice(names=("scene-1*",), nights=False))
 
 
 def test_frames_are_ordered_by_camera_then_time(tiny):
