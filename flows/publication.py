@@ -1,5 +1,6 @@
 """Publishing: which of the built tiles may be shown, and the one generation that shows them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,10 +28,11 @@ class Built:
         seconds = round(trained.get("seconds", 0.0) + self.extracted["seconds"], 1)
         return {**trained, **counts, "voxels": entry["voxel_count"], "bytes": entry["bytes"], "seconds": seconds}
 
-    @property
-    def tile(self) -> GenerationTile:
-        """The tile as a generation shows it."""
-        return GenerationTile(TileEntry.from_json(self.extracted["entry"]), self.job.recipe, {"metrics": self.metrics})
+    def tile(self, drive_names: Mapping[str, str] | None = None) -> GenerationTile:
+        """The tile as a generation shows it, with the names of its drives by their ids."""
+        entry, names = TileEntry.from_json(self.extracted["entry"]), drive_names or {}
+        lineage = {"metrics": self.metrics, "drive_names": {drive: names.get(drive, "") for drive in entry.drives}}
+        return GenerationTile(entry, self.job.recipe, lineage)
 
 
 def publish(
@@ -49,7 +51,8 @@ def publish(
             accepted.append(tile)
     number = plan.generation
     if accepted:
-        tiles = {tile.job.tile_id: tile.tile for tile in accepted}
+        names = {drive.drive_id: drive.name for drive in plan.drives}
+        tiles = {tile.job.tile_id: tile.tile(names) for tile in accepted}
         number = store.publish(plan.city, tiles, plan.generation, plan.tiling.to_json())
     for tile in accepted:
         catalog.finish_build(tile.job.build_id, "published", {**tile.metrics, "generation": number})
@@ -65,6 +68,6 @@ def publish(
 def _problems(store: PriorStore, plan: CityPlan, tile: Built, old: Generation | None) -> tuple[str, ...]:
     """Why a built tile may not be published."""
     shown = old.tiles.get(tile.job.tile_id) if old else None
-    new_summary = store.summary(plan.city, tile.tile)
+    new_summary = store.summary(plan.city, tile.tile())
     old_summary = store.summary(plan.city, shown) if shown else None
     return validate_tile(new_summary, tile.metrics, old_summary, plan.settings.validation)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from presight_core.errors import InputError
 from presight_core.progress import Report, silent
-from stages.table import CURE, read_table
+from presight_core.table import CURE, read_table
 
 TABLES = ("log", "scene", "sample", "sample_data", "ego_pose", "calibrated_sensor", "sensor")
 PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")  # a city or camera names folders of the store

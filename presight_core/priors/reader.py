@@ -79,6 +79,15 @@ class PriorReader:
         """The feature space of every voxel."""
         return self._city.space_id
 
+    @property
+    def drive_names(self) -> dict[str, str]:
+        """Scene names of the drives in the prior, by drive id; "" for drives published without a name."""
+        return {
+            drive: tile.lineage.get("drive_names", {}).get(drive, "")
+            for tile in self.generation.tiles.values()
+            for drive in tile.entry.drives
+        }
+
     def window(
         self,
         world_from_ego: ArrayLike,

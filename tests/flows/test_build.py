@@ -82,6 +82,11 @@ def test_the_reader_sees_the_streets_that_were_driven_and_finds_every_voxel(buil
     assert len(everything) == sum(tile.entry.voxel_count for tile in reader.generation.tiles.values())
 
 
+def test_the_generation_names_the_drives_it_was_made_from(built):
+    drives = built.catalog().drives(CITY)
+    assert PriorReader.open(built.store_location, CITY).drive_names == {each.drive_id: each.name for each in drives}
+
+
 def test_tiles_share_no_voxel(built):
     reader = PriorReader.open(built.store_location, CITY)
     first, second = (set(map(tuple, reader.tile(tile_id).block_index.tolist())) for tile_id in reader.tiles)

@@ -6,9 +6,9 @@ import math
 import msgspec
 import pytest
 
+from presight_core import table
 from presight_core.errors import InputError
-from stages import table
-from stages.table import read_table
+from presight_core.table import read_table
 
 
 class Row(msgspec.Struct):
