@@ -64,9 +64,7 @@ class PriorFusion2D(nn.Module):
 
         voxels (V, voxel_channels) of the whole batch; coordinates (V, 4) int64: sample, x, y, z.
         """
-        dense = _dense(self.voxel_feature_extractor(voxels), coordinates, bev.shape[0], self.settings.grid)
-        height = dense.shape[3] // SLICE_VOXELS
-        slices = dense[:, :, :, : height * SLICE_VOXELS].unflatten(3, (height, SLICE_VOXELS)).amax(4)
+        slices = _slices(self.voxel_feature_extractor(voxels), coordinates, bev.shape[0], self.settings.grid)
         flat = self.block1(slices.permute(0, 4, 3, 1, 2).flatten(1, 2))  # a channel's slices side by side
         prior = functional.interpolate(flat, bev.shape[-2:], mode="bilinear", align_corners=False)
         fused = self.block2(torch.cat([bev, prior], 1))
@@ -104,6 +102,21 @@ class PriorFusion3D(nn.Module):
         prior = flat.unflatten(1, (-1, self.settings.heights)).permute(0, 1, 3, 4, 2)
         fused = self.block2(torch.cat([bev, prior], 1))
         return torch.relu(fused + bev if self.settings.residual else fused)
+
+
+def _slices(features: Tensor, coordinates: Tensor, sample_count: int, grid: VoxelGrid) -> Tensor:
+    """The greatest features (B, Y, X, Z / 4, C) of the voxels (V, C), none negative, in slices; zeros without any.
+
+    Straight from the voxels: through a dense grid of them it takes three times as long.
+    """
+    x_count, y_count, z_count = grid.shape
+    slice_count = z_count // SLICE_VOXELS  # voxels above the last whole slice are left out, as released
+    sample, x, y, z = coordinates.unbind(1)
+    row = ((sample * y_count + y) * x_count + x) * slice_count + (z // SLICE_VOXELS).clamp(max=slice_count - 1)
+    features = features * (z < slice_count * SLICE_VOXELS).unsqueeze(1)
+    empty = features.new_zeros(sample_count * y_count * x_count * slice_count, features.shape[1])
+    slices = empty.scatter_reduce(0, row.unsqueeze(1).expand_as(features), features, "amax")
+    return slices.view(sample_count, y_count, x_count, slice_count, -1)
 
 
 def _dense(features: Tensor, coordinates: Tensor, sample_count: int, grid: VoxelGrid) -> Tensor:
