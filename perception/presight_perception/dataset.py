@@ -142,6 +142,24 @@ class CityPriors:
         """Feature channels of a point; 0 without any city."""
         return max((reader.channel_count for reader in self._readers.values()), default=0)
 
+    @property
+    def space_id(self) -> str:
+        """The feature space of all cities; "" without any city."""
+        return next((reader.space_id for reader in self._readers.values()), "")
+
+    @property
+    def drive_names(self) -> dict[str, dict[str, str]]:
+        """Of each city, the scene names of the drives in its prior by their ids, which `without_drives` takes."""
+        return {city: reader.drive_names for city, reader in self._readers.items()}
+
+    @property
+    def builds(self) -> dict[str, list[str]]:
+        """Of each city, the digests of its tiles' contents: equal ones mean equal priors."""
+        return {
+            city: sorted(tile.entry.digest for tile in reader.generation.tiles.values())
+            for city, reader in self._readers.items()
+        }
+
     def points(self, place: Place, ranges: tuple[Range, Range, Range]) -> PriorPoints:
         """The prior in a box around a place. Raises InputError for a city that was not opened."""
         if place.city is None:

@@ -1,0 +1,129 @@
+"""What experiments are made of: keyframes to train and to test on, and the priors around them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from presight_core.errors import InputError, NotFoundError
+from presight_core.nuscenes_split import Role
+from presight_perception.dataset import CityPriors, Place, PriorDataset, PriorSettings
+from presight_perception.experiment.keyframes import ImageSize, Keyframe, read_images, read_keyframes
+from presight_perception.experiment.runs import PriorKind, Probe, Run, digest
+from presight_perception.voxelise import VoxelGrid
+
+GEOMETRY_CHANNELS = 4  # of a voxel: its place and its hits
+CACHE_BYTES = 1 << 30  # of prior windows a process: those of a thousand tiny samples
+
+
+@dataclass(frozen=True)
+class Locations:
+    """Where everything is, and how much of it to take."""
+
+    data: Path  # root of a data set in nuScenes format
+    version: str
+    store: str  # of the priors: folder or URL
+    image_size: ImageSize = field(default_factory=ImageSize)
+    test_stride: int = 2  # every so many-th keyframe of a test drive is tried: neighbours look alike
+
+
+class Material:
+    """The data of all runs: made once in each process."""
+
+    def __init__(self, locations: Locations) -> None:
+        """Raises InputError for a data set without training or test scenes of the paper's split."""
+        self.locations = locations
+        self.keyframes = read_keyframes(locations.data, locations.version)
+        self.image = cache(self._image)
+
+    @cached_property
+    def train(self) -> list[Keyframe]:
+        """Keyframes of the training scenes."""
+        return self._of_role("train")
+
+    @cached_property
+    def test(self) -> list[Keyframe]:
+        """Some keyframes of each test scene."""
+        stride, scenes = self.locations.test_stride, {}
+        for keyframe in self._of_role("test"):
+            scenes.setdefault(keyframe.scene, []).append(keyframe)
+        return [keyframe for scene in scenes.values() for keyframe in scene[stride // 2 :: stride]]
+
+    @cached_property
+    def priors(self) -> CityPriors:
+        """The priors of all cities that have one; cities without are driven without.
+
+        Raises InputError if a test city has none.
+        """
+        generations = {}
+        for city in sorted({keyframe.city for keyframe in self.keyframes}):
+            try:
+                generations |= CityPriors(self.locations.store, {city: None}).generations
+            except NotFoundError:
+                continue
+        missing = {keyframe.city for keyframe in self.test} - generations.keys()
+        if missing:
+            raise InputError(
+                f"{self.locations.store} has no prior of {', '.join(sorted(missing))}; "
+                f"build it: presight ingest {self.locations.data} --no-tests --no-nights, then presight build CITY"
+            )
+        return CityPriors(self.locations.store, generations)
+
+    @property
+    def digest(self) -> str:
+        """Names the keyframes and how they are read; the priors' own name is `prior_digest`."""
+        tokens = [keyframe.token for keyframe in [*self.train, *self.test]]
+        return digest(tokens, self.locations.image_size, self.locations.test_stride)
+
+    def prior_digest(self, kind: PriorKind) -> str:
+        """Names the prior that runs of a kind see."""
+        return "" if kind == "none" else digest(kind, self.priors.builds)
+
+    def voxel_channels(self, kind: PriorKind) -> int | None:
+        """Channels of a prior's voxel; None without a prior."""
+        if kind == "none":
+            return None
+        return GEOMETRY_CHANNELS + (self.priors.channel_count if kind == "presight" else 0)
+
+    def training_prior(self, run: Run, grid: VoxelGrid) -> PriorDataset:
+        """The prior around the training keyframes, each without its own drive."""
+        settings = PriorSettings(grid, run.prior != "geometry", drop=run.drop, cache_bytes=CACHE_BYTES, seed=run.seed)
+        return PriorDataset(self.priors, [self._place(each, own=False) for each in self.train], settings)
+
+    def test_prior(self, run: Run, probe: Probe, grid: VoxelGrid) -> PriorDataset:
+        """The prior around the test keyframes as a probe shows it."""
+        settings = PriorSettings(grid, run.prior != "geometry", noise=probe.noise, seed=run.seed)
+        return PriorDataset(self.priors, [self._place(each, drives=probe.drives) for each in self.test], settings)
+
+    def _place(self, keyframe: Keyframe, own: bool = True, drives: str = "all") -> Place:
+        names = self.priors.drive_names.get(keyframe.city, {})
+        if keyframe.city not in self.priors.generations or drives == "none":
+            return Place(None, keyframe.world_from_ego)
+        hidden = [] if own else [drive for drive, name in names.items() if name == keyframe.scene]
+        if drives == "half":
+            hidden = sorted(names, key=lambda drive: names[drive])[1::2]
+        return Place(keyframe.city, keyframe.world_from_ego, tuple(hidden))
+
+    def _of_role(self, role: Role) -> list[Keyframe]:
+        chosen = [keyframe for keyframe in self.keyframes if keyframe.role == role]
+        if not chosen:
+            raise InputError(
+                f"{self.locations.data}: no {role} scene of the paper's split; make one with "
+                "presight synth OUT --preset experiment"
+            )
+        return chosen
+
+    def _image(self, token: str) -> Tensor:
+        return read_images(self._by_token[token], self.locations.image_size)
+
+    @cached_property
+    def _by_token(self) -> dict[str, Keyframe]:
+        return {keyframe.token: keyframe for keyframe in self.keyframes}
+
+
+def spread(keyframes: Sequence[Keyframe], count: int) -> list[int]:
+    """Places of some keyframes, evenly over all."""
+    return np.linspace(0, len(keyframes) - 1, min(count, len(keyframes))).round().astype(int).tolist()

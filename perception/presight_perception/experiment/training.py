@@ -1,0 +1,126 @@
+"""Train one model, going on where an interrupted training stopped."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from presight_core.progress import Progress, Report
+from presight_perception.dataset import PriorBatch, collate
+from presight_perception.experiment.keyframes import rig_of
+from presight_perception.experiment.material import Material
+from presight_perception.experiment.runs import Run, Schedule
+from presight_perception.experiment.tasks import MODELS, Task
+from presight_perception.models.bev_features import Sources
+from presight_perception.models.camera_rig import CameraRig
+
+CHECKPOINT_STEPS = 100  # a minute or two of work at most is done again
+REPORT_STEPS = 10
+GRADIENT_NORM = 35.0  # greatest; as in the released configurations
+WARM_UP = 0.15  # of the steps
+
+
+def build_model(run: Run, material: Material) -> nn.Module:
+    """The untrained model of a run, the same one for the same seed."""
+    torch.manual_seed(run.seed)
+    return MODELS[run.model](Sources(run.cameras, material.voxel_channels(run.prior)))
+
+
+def trained_model(run: Run, task: Task, material: Material, folder: Path, report: Report) -> nn.Module:
+    """The model of a run, from `folder` if it was trained before, else trained and kept there."""
+    model, weights = build_model(run, material), folder / "weights.safetensors"
+    if not weights.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        _Training(run, task, material, model, folder / "checkpoint.pt").go(report)
+        _write_whole(weights, lambda file: save_file(model.state_dict(), file))
+        (folder / "checkpoint.pt").unlink(missing_ok=True)
+    model.load_state_dict(load_file(weights))
+    return model.eval()
+
+
+class _Training:
+    def __init__(self, run: Run, task: Task, material: Material, model: nn.Module, checkpoint: Path) -> None:
+        self._run, self._task, self._material, self._model = run, task, material, model
+        self._checkpoint = checkpoint
+        schedule = run.schedule
+        self._optimizer = torch.optim.AdamW(
+            model.parameters(), schedule.learning_rate, weight_decay=schedule.weight_decay
+        )
+        self._rate = torch.optim.lr_scheduler.OneCycleLR(
+            self._optimizer, schedule.learning_rate, total_steps=schedule.steps, pct_start=WARM_UP
+        )
+        self._prior = None if run.prior == "none" else material.training_prior(run, task.prior_grid)
+
+    def go(self, report: Report) -> None:
+        """All steps that are left."""
+        losses: list[float] = []
+        self._model.train()
+        for step in range(self._resume(), self._run.schedule.steps):
+            losses.append(self._step(batch_rows(self._run.schedule, self._run.seed, len(self._material.train), step)))
+            done = step + 1
+            if done % REPORT_STEPS == 0 or done == self._run.schedule.steps:
+                figures = {"loss": float(np.mean(losses[-5 * REPORT_STEPS :]))}
+                report(Progress(self._run.title, done, self._run.schedule.steps, figures))
+            if done % CHECKPOINT_STEPS == 0:
+                self._keep(done)
+
+    def _step(self, rows: list[int]) -> float:
+        images, rig, prior = self._inputs(rows)
+        truths = [self._task.truth(self._model, self._material.train[row]) for row in rows]
+        losses: dict[str, Tensor] = self._model.loss(self._model(images, rig, prior), truths)  # pyright: ignore
+        loss = torch.stack(list(losses.values())).sum()
+        self._optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self._model.parameters(), GRADIENT_NORM)
+        self._optimizer.step()
+        self._rate.step()
+        return loss.item()
+
+    def _inputs(self, rows: list[int]) -> tuple[Tensor | None, CameraRig | None, PriorBatch | None]:
+        prior = collate([self._prior[row] for row in rows]) if self._prior is not None else None
+        if not self._run.cameras:
+            return None, None, prior
+        keyframes = [self._material.train[row] for row in rows]
+        images = torch.stack([self._material.image(keyframe.token) for keyframe in keyframes])
+        return images.float() / 255, rig_of(keyframes, self._material.locations.image_size), prior
+
+    def _resume(self) -> int:
+        """The step to go on with."""
+        if not self._checkpoint.exists():
+            return 0
+        state: dict[str, Any] = torch.load(self._checkpoint, weights_only=True)
+        self._model.load_state_dict(state["model"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._rate.load_state_dict(state["rate"])
+        torch.set_rng_state(state["random"])
+        return state["step"]
+
+    def _keep(self, step: int) -> None:
+        state = {
+            "model": self._model.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "rate": self._rate.state_dict(),
+            "random": torch.get_rng_state(),
+            "step": step,
+        }
+        _write_whole(self._checkpoint, lambda file: torch.save(state, file))
+
+
+def batch_rows(schedule: Schedule, seed: int, count: int, step: int) -> list[int]:
+    """The samples of one step: every epoch is another order of all, and no step depends on an earlier one."""
+    first = step * schedule.batch_size
+    rows = []
+    for place in range(first, first + schedule.batch_size):
+        epoch, rank = divmod(place, count)
+        rows.append(int(np.random.default_rng([seed, epoch]).permutation(count)[rank]))
+    return rows
+
+
+def _write_whole(file: Path, write: Any) -> None:
+    """Write a file such that it is there whole or not at all."""
+    part = file.with_suffix(".part")
+    write(part)
+    part.replace(file)

@@ -1,0 +1,93 @@
+"""Try a trained model on the test scenes, as a probe says."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from presight_core.progress import Progress, Report, silent
+from presight_perception.dataset import PriorBatch, PriorSample, collate
+from presight_perception.experiment.keyframes import Keyframe, rig_of
+from presight_perception.experiment.material import Material
+from presight_perception.experiment.runs import Probe, Run
+from presight_perception.experiment.tasks import Figures, MapTask, MaskScorer, Scorer, Task
+from presight_perception.models.camera_rig import CameraRig
+from presight_perception.models.raster_mapper import RasterMapperSettings
+from presight_perception.voxelise import BevAugmentation
+
+BATCH = 4
+LEVELS = 50  # of the thresholds that a constant mask is cut at
+
+
+class Trial:
+    """One trained model under one probe."""
+
+    def __init__(self, model: nn.Module, run: Run, probe: Probe, task: Task, material: Material) -> None:
+        self._model, self._run, self._probe = model, run, probe
+        self._task, self._material = task, material
+        self._prior = None if run.prior == "none" else material.test_prior(run, probe, task.prior_grid)
+
+    def figures(self, report: Report = silent) -> dict[str, Figures]:
+        """Figures over all test keyframes, and over those by night and by day."""
+        count = len(self._material.test)
+        scorers: dict[str, Scorer] = defaultdict(lambda: self._task.scorer(self._model))
+        for first in range(0, count, BATCH):
+            rows = range(first, min(first + BATCH, count))
+            for row, found in zip(rows, self.found(rows), strict=True):
+                _add(scorers, found, self._material.test[row])
+            report(Progress(f"{self._run.title}, tried", rows[-1] + 1, count))
+        return {name: scorer.result() for name, scorer in scorers.items()}
+
+    def found(self, rows: Sequence[int]) -> Sequence[Any]:
+        """What the model finds in some test keyframes, decoded."""
+        images, rig = self._images(rows) if self._run.cameras and self._probe.cameras else (None, None)
+        prior = None if self._prior is None else self.prior(rows)
+        with torch.inference_mode():
+            return self._model.decode(self._model(images, rig, prior))  # pyright: ignore[reportCallIssue]
+
+    def prior(self, rows: Sequence[int]) -> PriorBatch:
+        """The prior around some test keyframes. Only for runs with one."""
+        assert self._prior is not None
+        if not self._probe.mirrored:
+            return collate([self._prior[row] for row in rows])
+        mirror, straight = BevAugmentation(flip_y=True), BevAugmentation()
+        draws = np.random.default_rng(0)  # of noise, which such a probe has none of
+        return collate([PriorSample(self._prior.voxels(row, mirror, draws), straight) for row in rows])
+
+    def _images(self, rows: Sequence[int]) -> tuple[Tensor, CameraRig]:
+        keyframes = [self._material.test[row] for row in rows]
+        images = torch.stack([self._material.image(keyframe.token) for keyframe in keyframes])
+        return images.float() / 255, rig_of(keyframes, self._material.locations.image_size)
+
+
+def constant_mask_figures(task: MapTask, material: Material) -> dict[str, Figures]:
+    """Figures of one mask for all samples, without any model: where the training truth most often has a class."""
+    settings = RasterMapperSettings.tiny()
+    truth = MaskScorer(task, settings)
+    trained = np.stack([truth.true_masks(keyframe) for keyframe in material.train])
+    masks = np.stack([_best_cut(trained[:, each]) for each in range(trained.shape[1])])
+    scorers: dict[str, Scorer] = defaultdict(lambda: MaskScorer(task, settings))
+    for keyframe in material.test:
+        _add(scorers, masks, keyframe)
+    return {name: scorer.result() for name, scorer in scorers.items()}
+
+
+def _add(scorers: dict[str, Scorer], found: Any, keyframe: Keyframe) -> None:
+    for name in ("all", "night" if keyframe.is_night else "day"):
+        scorers[name].add(found, keyframe)
+
+
+def _best_cut(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask (H, W) that overlaps the masks (N, H, W) best, of those that cut their mean at one level."""
+    mean = masks.mean(0)
+
+    def overlap(level: float) -> float:
+        cut = mean >= level
+        common = masks[:, cut].sum()
+        return common / (masks.sum() + cut.sum() * len(masks) - common)
+
+    return mean >= max(np.linspace(0, mean.max(), LEVELS + 1)[1:], key=overlap)
