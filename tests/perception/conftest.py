@@ -12,15 +12,22 @@ from storage.tile_groups import TileName
 TILING = {"tiling_id": "tiling-1", "city": "town", "tiles": [{"tile_id": "t000", "centroid_m": [0.0, 0.0]}]}
 
 
-def publish(location: Path, build: str, parent: int | None, seed: int = 0) -> None:
-    """Publish a generation of the city "town": one tile of 51 x 51 m around the world's origin, seen by 3 drives."""
+def publish(
+    location: Path, build: str, parent: int | None, seed: int = 0, drive_names: dict[str, str] | None = None
+) -> None:
+    """Publish a generation of the city "town": one tile of 51 x 51 m around the world's origin, seen by 3 drives.
+
+    drive_names: scene names of its drives, drive-0 to drive-2.
+    """
     example = ExampleTile(seed=seed, voxels_per_block=400)
     store = PriorStore.open(location)
     if parent is None:
         store.create_city("town", example.lattice, "space-1", example.channel_count)
     drives = [f"drive-{number}" for number in range(example.drive_count)]
     entry = store.write_tile("town", TileName("t000", build), example.batches(), drives, {"recipe": {}})
-    store.publish("town", {"t000": GenerationTile(entry, {"stage": "test"})}, parent, TILING)
+    store.publish(
+        "town", {"t000": GenerationTile(entry, {"stage": "test"}, {"drive_names": drive_names or {}})}, parent, TILING
+    )
 
 
 @pytest.fixture(scope="session")
