@@ -1,4 +1,4 @@
-"""The 19 Cityscapes classes of the label maps (train ids; 255 is unknown)."""
+"""The 19 Cityscapes classes of the label maps (train ids), and Occ3D's 18 of voxels; 255 is unknown in both."""
 
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,12 @@ CITYSCAPES = (
 SKY = CITYSCAPES.index("sky")
 UNKNOWN = 255
 DYNAMIC = ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle")  # paper, section 4.2
+
+# Of Occ3D-nuScenes: voxels around a vehicle. Those before driveable_surface move, or could be moved.
+OCC3D = (
+    "others", "barrier", "bicycle", "bus", "car", "construction_vehicle", "motorcycle", "pedestrian", "traffic_cone",
+    "trailer", "truck", "driveable_surface", "other_flat", "sidewalk", "terrain", "manmade", "vegetation", "free",
+)  # fmt: skip
 
 # The customary Cityscapes colours, for people.
 COLOURS = (

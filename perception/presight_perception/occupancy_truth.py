@@ -7,17 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from presight_core.classes import OCC3D
 from presight_core.errors import InputError, NotFoundError
 
-OCCUPANCY_CLASSES = (
-    "others", "barrier", "bicycle", "bus", "car", "construction_vehicle", "motorcycle", "pedestrian", "traffic_cone",
-    "trailer", "truck", "driveable_surface", "other_flat", "sidewalk", "terrain", "manmade", "vegetation", "free",
-)  # fmt: skip
+OCCUPANCY_CLASSES = OCC3D
 OCCUPIED_CLASSES = OCCUPANCY_CLASSES[:17]
 DYNAMIC_CLASSES = OCCUPANCY_CLASSES[:11]  # the paper's grouping, with barriers and cones
 STATIC_CLASSES = OCCUPANCY_CLASSES[11:17]
 FREE = OCCUPANCY_CLASSES.index("free")
-UNKNOWN = 255
 
 RANGE_LOW_M = (-40.0, -40.0, -1.0)  # ego frame at the lidar's time
 RANGE_HIGH_M = (40.0, 40.0, 5.4)

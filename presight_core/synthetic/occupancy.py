@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from presight_core.cameras import Camera
-from presight_core.classes import CITYSCAPES
+from presight_core.classes import CITYSCAPES, OCC3D
 from presight_core.frames import invert
 from presight_core.synthetic.actors import KINDS, Actor, actor_mesh
 from presight_core.synthetic.city import City
@@ -22,12 +22,8 @@ from presight_core.synthetic.mesh import Mesh
 from presight_core.synthetic.raycast import RayCaster, Rays
 from presight_core.synthetic.surface_points import Bounds, exposed, sample_surface
 
-CLASSES = (
-    "others", "barrier", "bicycle", "bus", "car", "construction_vehicle", "motorcycle", "pedestrian", "traffic_cone",
-    "trailer", "truck", "driveable_surface", "other_flat", "sidewalk", "terrain", "manmade", "vegetation", "free",
-)  # fmt: skip
-FREE = CLASSES.index("free")
-FIRST_STATIC = CLASSES.index("driveable_surface")  # classes below are objects, from here on parts of the city
+FREE = OCC3D.index("free")
+FIRST_STATIC = OCC3D.index("driveable_surface")  # classes below are objects, from here on parts of the city
 SHAPE = (200, 200, 16)  # x forward, y left, z up
 LOW_M = (-40.0, -40.0, -1.0)  # ego frame
 VOXEL_M = 0.4
@@ -43,7 +39,7 @@ for _label, _name in {
     "building": "manmade", "wall": "manmade", "fence": "manmade", "pole": "manmade", "traffic light": "manmade",
     "traffic sign": "manmade",
 }.items():  # fmt: skip
-    _CLASS_OF_LABEL[CITYSCAPES.index(_label)] = CLASSES.index(_name)
+    _CLASS_OF_LABEL[CITYSCAPES.index(_label)] = OCC3D.index(_name)
 _CLASS_OF_CATEGORY = {  # by how the nuScenes category begins
     "vehicle.car": "car", "vehicle.truck": "truck", "vehicle.trailer": "trailer", "vehicle.bus": "bus",
     "vehicle.construction": "construction_vehicle", "vehicle.motorcycle": "motorcycle", "vehicle.bicycle": "bicycle",
@@ -55,7 +51,7 @@ _CLASS_OF_CATEGORY = {  # by how the nuScenes category begins
 class Occupancy(NamedTuple):
     """The three arrays of a `labels.npz`, SHAPE each."""
 
-    semantics: NDArray[np.uint8]  # index into CLASSES
+    semantics: NDArray[np.uint8]  # index into OCC3D
     mask_lidar: NDArray[np.uint8]  # 1: observed
     mask_camera: NDArray[np.uint8]
 
@@ -64,7 +60,7 @@ class Samples(NamedTuple):
     """Points on surfaces and what they are."""
 
     points: NDArray[np.float32]  # (N, 3) world
-    classes: NDArray[np.uint8]  # (N,) index into CLASSES
+    classes: NDArray[np.uint8]  # (N,) index into OCC3D
 
 
 class CitySurfaces:
@@ -160,7 +156,7 @@ def write_occupancy(path: Path, occupancy: Occupancy) -> None:
 def static_classes(mesh: Mesh) -> NDArray[np.uint8]:
     """The class of each face (F,) of the city; paved yards are `other_flat`, what has no class is `others`."""
     classes = _CLASS_OF_LABEL[mesh.labels]
-    classes[mesh.materials == Material.PLAZA] = CLASSES.index("other_flat")
+    classes[mesh.materials == Material.PLAZA] = OCC3D.index("other_flat")
     return classes
 
 
@@ -173,7 +169,7 @@ def actor_classes(actors: Sequence[Actor], mesh: Mesh) -> NDArray[np.uint8]:
 
 def _class_of_category(category: str) -> int:
     found = [name for start, name in _CLASS_OF_CATEGORY.items() if category.startswith(start)]
-    return CLASSES.index(found[0] if found else "others")
+    return OCC3D.index(found[0] if found else "others")
 
 
 def _voxel_from_ego() -> NDArray[np.float64]:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from presight_core.cameras import pixel_centres
-from presight_core.classes import CITYSCAPES
+from presight_core.classes import CITYSCAPES, OCC3D
 from presight_core.frames import apply, invert
 from presight_core.synthetic import lidar, occupancy
 from presight_core.synthetic.actors import FIRST_ACTOR, Actor, actor_mesh
 from presight_core.synthetic.city import City
 from presight_core.synthetic.materials import Material
 from presight_core.synthetic.mesh import BOX_FACES, Box, MeshBuilder, Surface
-from presight_core.synthetic.occupancy import CLASSES, FREE, SHAPE, CitySurfaces, Moment, Occupancy, label_occupancy
+from presight_core.synthetic.occupancy import FREE, SHAPE, CitySurfaces, Moment, Occupancy, label_occupancy
 from presight_core.synthetic.raster import draw_perspective
 from presight_core.synthetic.raycast import RayCaster, Rays
 from presight_core.synthetic.renderer import ground_truth, pinhole_view
@@ -295,8 +295,8 @@ def test_an_actor_takes_its_voxels_from_the_ground(moment: Moment, world_from_eg
     nothing = Rays(np.zeros(3), np.zeros((0, 3)), np.zeros(0, np.float32))
     semantics = label_occupancy(moment, world_from_ego, [], nothing).semantics
     place = semantics[117:123, 98:102, 2:7]
-    assert np.isin(CLASSES.index("bicycle"), place[:, :, 0])  # where its wheels stand
-    assert set(np.unique(semantics[117:123, 98:102, 3:])) == {CLASSES.index("bicycle"), FREE}
+    assert np.isin(OCC3D.index("bicycle"), place[:, :, 0])  # where its wheels stand
+    assert set(np.unique(semantics[117:123, 98:102, 3:])) == {OCC3D.index("bicycle"), FREE}
 
 
 @pytest.mark.parametrize(
@@ -308,7 +308,7 @@ def test_an_actor_takes_its_voxels_from_the_ground(moment: Moment, world_from_eg
     ],
 )  # fmt: skip
 def test_nuscenes_categories_have_their_occ3d_class(category: str, name: str):
-    assert CLASSES[occupancy._class_of_category(category)] == name
+    assert OCC3D[occupancy._class_of_category(category)] == name
 
 
 def test_written_labels_have_the_three_arrays_of_occ3d(tmp_path: Path, labels: Occupancy):

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from presight_core.classes import UNKNOWN
 from presight_core.errors import InputError
 from presight_perception.models.camera_rig import CameraRig
 from presight_perception.models.lift_splat import DepthBins, depth_bins, moved
 from presight_perception.models.occ_losses import depth_loss
-from presight_perception.occupancy_truth import OCCUPANCY_CLASSES, RANGE_LOW_M, UNKNOWN, VOXEL_M, OccupancyTruth
+from presight_perception.occupancy_truth import OCCUPANCY_CLASSES, RANGE_LOW_M, VOXEL_M, OccupancyTruth
 from presight_perception.voxelise import VoxelGrid
 
 CLASS_COUNT = len(OCCUPANCY_CLASSES)
