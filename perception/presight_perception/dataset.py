@@ -4,7 +4,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -101,6 +101,25 @@ class PriorPoints(NamedTuple):
     features: NDArray[np.uint8]  # (N, C) 255 = 1.0
     weights: NDArray[np.float32]  # (N,) hits over the generation's mean hits: one scale for all cities
 
+    @staticmethod
+    def none(channel_count: int) -> "PriorPoints":
+        """No points, of so many channels."""
+        features = np.zeros((0, channel_count), np.uint8)
+        return PriorPoints(np.zeros((0, 3), np.float32), features, np.zeros(0, np.float32))
+
+
+class PriorSource(Protocol):
+    """Where priors come from: `CityPriors`, or a kind to compare with, such as `LidarHistory`. Can be pickled."""
+
+    @property
+    def channel_count(self) -> int:
+        """Feature channels of a point."""
+        ...
+
+    def points(self, place: Place, ranges: tuple[Range, Range, Range]) -> PriorPoints:
+        """The prior in a box around a place; none where its city is None."""
+        ...
+
 
 class PriorSample(NamedTuple):
     """One sample's voxels, and how they were augmented: turn the targets and online features alike."""
@@ -163,8 +182,7 @@ class CityPriors:
     def points(self, place: Place, ranges: tuple[Range, Range, Range]) -> PriorPoints:
         """The prior in a box around a place. Raises InputError for a city that was not opened."""
         if place.city is None:
-            none = np.zeros((0, self.channel_count), np.uint8)
-            return PriorPoints(np.zeros((0, 3), np.float32), none, np.zeros(0, np.float32))
+            return PriorPoints.none(self.channel_count)
         if place.city not in self._readers:
             raise InputError(f"{place.city!r} was not opened, only {sorted(self._readers)}; name it in `generations`")
         window = self._readers[place.city].window(place.world_from_ego, *ranges, without_drives=place.without_drives)
@@ -175,7 +193,7 @@ class CityPriors:
 class PriorDataset(Dataset[PriorSample]):
     """Voxels of each place. What is drawn depends on seed, epoch and index alone, not on workers or their number."""
 
-    def __init__(self, priors: CityPriors, places: Sequence[Place], settings: PriorSettings | None = None) -> None:
+    def __init__(self, priors: PriorSource, places: Sequence[Place], settings: PriorSettings | None = None) -> None:
         self.priors = priors
         self.settings = settings or PriorSettings()
         self._places = places
