@@ -55,14 +55,16 @@ class LoadPrior:
     voxel_size: Sequence[float] = MAPPING_GRID.voxel_m
     with_features: bool = True  # False: position and hits alone, 4 channels
     drop: Mapping[str, float] | None = None  # for training: the fields of `VoxelDrop`
-    keys: Mapping[str, Any] = field(default_factory=dict)  # the fields of `ResultKeys` that differ from its defaults
+    result_keys: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # the fields of `ResultKeys` that differ from its defaults
     cities_without_prior: Sequence[str] = ()  # whose samples get no voxels, where other cities are an error
     cache_bytes: int = PriorSettings.cache_bytes  # of windows, in each worker process
     seed: int = 0  # besides torch's own, which each worker's generator has
 
     def __post_init__(self) -> None:
         try:
-            self._keys = ResultKeys(**self.keys)
+            self._keys = ResultKeys(**self.result_keys)
             drop = None if self.drop is None else VoxelDrop(**self.drop)
         except TypeError as error:
             raise SettingsError(f"LoadPrior: {error}; see ResultKeys and VoxelDrop for the names") from error
@@ -117,6 +119,12 @@ class LoadPrior:
 
     def _augmentation(self, results: Results) -> BevAugmentation:
         keys = self._keys
+        foreign = results.get("transformation_3d_flow")  # the names of mmdet3d's own augmentations, if any was drawn
+        if foreign and keys.rotation_deg not in results:
+            raise InputError(
+                f"mmdet3d augmented the sample ({foreign}), which the prior cannot follow; leave that step out, or have "
+                f"it write {keys.rotation_deg!r}, {keys.scale!r}, {keys.flip_x!r} and {keys.flip_y!r}"
+            )
         return BevAugmentation(
             rotation_rad=float(np.deg2rad(results.get(keys.rotation_deg, 0.0))),
             scale=float(results.get(keys.scale, 1.0)),
@@ -169,7 +177,7 @@ def _entry(results: Results, key: str) -> Any:
     for part in key.split("."):
         if not isinstance(value, Mapping) or part not in value:
             raise InputError(
-                f"the results hold no {key!r}, only {list(results)}; name the right key in LoadPrior's keys"
+                f"the results hold no {key!r}, only {list(results)}; name the right one in LoadPrior's result_keys"
             )
         value = value[part]
     return value

@@ -13,14 +13,16 @@ TILING = {"tiling_id": "tiling-1", "city": "town", "tiles": [{"tile_id": "t000",
 
 
 def publish(location: Path, build: str, parent: int | None, seed: int = 0) -> None:
-    """Publish a generation of the city "town": one tile of 51 x 51 m around the world's origin, seen by 3 drives."""
+    """Publish a generation of the city "town": one tile of 51 x 51 m around the origin, seen by 3 drives with names."""
     example = ExampleTile(seed=seed, voxels_per_block=400)
     store = PriorStore.open(location)
     if parent is None:
         store.create_city("town", example.lattice, "space-1", example.channel_count)
     drives = [f"drive-{number}" for number in range(example.drive_count)]
     entry = store.write_tile("town", TileName("t000", build), example.batches(), drives, {"recipe": {}})
-    store.publish("town", {"t000": GenerationTile(entry, {"stage": "test"})}, parent, TILING)
+    names = {drive: f"scene-{number:04d}" for number, drive in enumerate(drives)}
+    tile = GenerationTile(entry, {"stage": "test"}, {"drive_names": names})
+    store.publish("town", {"t000": tile}, parent, TILING)
 
 
 @pytest.fixture(scope="session")

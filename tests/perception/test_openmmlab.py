@@ -12,14 +12,10 @@ from torch.utils.data import DataLoader
 
 from presight_core import frames
 from presight_core.errors import InputError, MissingDependencyError, NotFoundError, SettingsError
-from presight_core.priors.documents import GenerationTile
-from presight_core.priors.example import ExampleTile
 from presight_perception.dataset import CityPriors, Place, PriorDataset, PriorSettings, merge
 from presight_perception.openmmlab import LoadPrior, register_new, register_old
 from presight_perception.voxelise import BevAugmentation, VoxelGrid, Voxels
-from storage.priors import PriorStore
-from storage.tile_groups import TileName
-from tests.perception.conftest import TILING, publish
+from tests.perception.conftest import publish
 
 GRID = VoxelGrid((-10.0, -6.0, -2.0), (10.0, 6.0, 6.0), (0.5, 0.5, 0.5))
 BOX = {"pc_range": [*GRID.low_m, *GRID.high_m], "voxel_size": list(GRID.voxel_m)}
@@ -52,17 +48,6 @@ def assert_equal(ours: Voxels, theirs: Voxels):
     assert len(theirs.features) > 100
     np.testing.assert_array_equal(ours.coordinates, theirs.coordinates)
     np.testing.assert_allclose(ours.features, theirs.features, atol=1e-6)
-
-
-def publish_named(location) -> None:
-    """Generation 1 of "town", in which the drive "drive-0" is named "scene-0001"."""
-    example = ExampleTile(voxels_per_block=400)
-    store = PriorStore.open(location)
-    store.create_city("town", example.lattice, "space-1", example.channel_count)
-    drives = [f"drive-{number}" for number in range(example.drive_count)]
-    entry = store.write_tile("town", TileName("t000", "build-1"), example.batches(), drives, {"recipe": {}})
-    tile = GenerationTile(entry, {"stage": "test"}, {"drive_names": {"drive-0": "scene-0001"}})
-    store.publish("town", {"t000": tile}, None, TILING)
 
 
 class Registry:
@@ -132,7 +117,7 @@ def test_the_step_keeps_the_rest_of_the_results(town):
     ],
 )
 def test_city_and_pose_are_found_where_data_sets_put_them(town, keys, results):
-    assert_equal(found(step(town, keys=keys)(results)), expected(town, Place("town", POSE)))
+    assert_equal(found(step(town, result_keys=keys)(results)), expected(town, Place("town", POSE)))
 
 
 def test_with_a_lidar_pose_the_grid_lies_in_the_lidars_frame(town):
@@ -140,27 +125,42 @@ def test_with_a_lidar_pose_the_grid_lies_in_the_lidars_frame(town):
     ego_from_lidar[2, 3] = 1.8
     keys = {"ego_from_lidar": "lidar_points.lidar2ego"}
     results = results_at(lidar_points={"lidar2ego": ego_from_lidar.tolist()})
-    assert_equal(found(step(town, keys=keys)(results)), expected(town, Place("town", POSE @ ego_from_lidar)))
+    assert_equal(found(step(town, result_keys=keys)(results)), expected(town, Place("town", POSE @ ego_from_lidar)))
 
 
-def test_voxels_are_augmented_as_an_earlier_step_says(town):
-    results = results_at(rotate_bda=-20.0, scale_bda=1.05, flip_dx=True, flip_dy=False)
-    augmentation = BevAugmentation(np.deg2rad(-20.0), 1.05, flip_x=True)
-    everything = ((-90.0, 90.0), (-90.0, 90.0), (-90.0, 90.0))
-    points = CityPriors(town, {"town": 1}).points(Place("town", POSE), everything)
-    theirs = PriorSettings(GRID).voxels(points, augmentation, np.random.default_rng(0))
-    assert_equal(found(step(town)(results)), theirs)
+@pytest.mark.parametrize(
+    ("results", "augmentation"),
+    [
+        (
+            {"rotate_bda": -20.0, "scale_bda": 1.05, "flip_dx": True, "flip_dy": False},
+            BevAugmentation(np.deg2rad(-20.0), 1.05, flip_x=True),
+        ),
+        ({"flip_dx": torch.tensor(True)}, BevAugmentation(flip_x=True)),
+        ({"flip_dy": True, "scale_bda": 0.9}, BevAugmentation(0.0, 0.9, flip_y=True)),
+    ],
+)
+def test_voxels_are_augmented_as_an_earlier_step_says(town, results, augmentation):
+    ahead = VoxelGrid((0.0, -6.0, -2.0), (10.0, 4.0, 6.0), (0.5, 0.5, 0.5))
+    load = step(town, pc_range=[*ahead.low_m, *ahead.high_m])
+    points = CityPriors(town, {"town": 1}).points(Place("town", POSE), ((-90.0, 90.0), (-90.0, 90.0), (-90.0, 90.0)))
+    theirs = PriorSettings(ahead).voxels(points, augmentation, np.random.default_rng(0))
+    assert_equal(found(load(results_at(**results))), theirs)
 
 
-def test_the_samples_own_drive_is_left_out_by_name_or_by_id(tmp_path):
-    publish_named(tmp_path)
-    without = expected(tmp_path, Place("town", POSE, ("drive-0",)))
-    whole = expected(tmp_path, Place("town", POSE))
-    load = step(tmp_path, keys={"drive": "scene_name"})
+def test_an_augmentation_that_the_prior_cannot_follow_is_refused(town):
+    results = results_at(transformation_3d_flow=["R", "S", "T"])
+    with pytest.raises(InputError, match=r"\['R', 'S', 'T'\].*'rotate_bda'"):
+        step(town)(dict(results))
+    assert len(found(step(town)({**results, "rotate_bda": 10.0})).features) > 100
+
+
+def test_the_samples_own_drive_is_left_out_by_name_or_by_id(town):
+    whole, without = (expected(town, Place("town", POSE, drives)) for drives in ((), ("drive-1",)))
+    load = step(town, result_keys={"drive": "scene_name"})
     assert len(without.features) < len(whole.features)
     assert_equal(found(load(results_at(scene_name="scene-0001"))), without)
-    assert_equal(found(load(results_at(scene_name="drive-0"))), without)
-    assert_equal(found(load(results_at(scene_name="scene-0002"))), whole)
+    assert_equal(found(load(results_at(scene_name="drive-1"))), without)
+    assert_equal(found(load(results_at(scene_name="scene-0009"))), whole)
 
 
 def test_a_drop_is_drawn_anew_each_time_and_again_from_the_same_seed(town):
@@ -208,7 +208,7 @@ def test_a_pose_of_another_form_is_refused(town):
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"keys": {"town": "location"}},
+        {"result_keys": {"town": "location"}},
         {"drop": {"share": 0.5}},
         {"pc_range": [-10, -10, 10, 10]},
         {"pc_range": [-10, -10, -2, 10, 10, 2.2]},
