@@ -140,7 +140,7 @@ def test_with_a_lidar_pose_the_grid_lies_in_the_lidars_frame(town):
     ],
 )
 def test_voxels_are_augmented_as_an_earlier_step_says(town, results, augmentation):
-    ahead = VoxelGrid((0.0, -6.0, -2.0), (10.0, 4.0, 6.0), (0.5, 0.5, 0.5))
+    ahead = VoxelGrid((0.0, -8.0, -2.0), (14.0, 5.0, 6.0), (0.5, 0.5, 0.5))
     load = step(town, pc_range=[*ahead.low_m, *ahead.high_m])
     points = CityPriors(town, {"town": 1}).points(Place("town", POSE), ((-90.0, 90.0), (-90.0, 90.0), (-90.0, 90.0)))
     theirs = PriorSettings(ahead).voxels(points, augmentation, np.random.default_rng(0))
