@@ -55,9 +55,7 @@ class LoadPrior:
     voxel_size: Sequence[float] = MAPPING_GRID.voxel_m
     with_features: bool = True  # False: position and hits alone, 4 channels
     drop: Mapping[str, float] | None = None  # for training: the fields of `VoxelDrop`
-    result_keys: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # the fields of `ResultKeys` that differ from its defaults
+    result_keys: Mapping[str, Any] = field(default_factory=dict)  # fields of `ResultKeys` unlike its defaults
     cities_without_prior: Sequence[str] = ()  # whose samples get no voxels, where other cities are an error
     cache_bytes: int = PriorSettings.cache_bytes  # of windows, in each worker process
     seed: int = 0  # besides torch's own, which each worker's generator has
@@ -113,6 +111,11 @@ class LoadPrior:
         city = _entry(results, keys.city)
         if city in self.cities_without_prior:
             return Place(None, world_from_grid)
+        if city not in self.cities:
+            raise InputError(
+                f"a sample is in {city!r}, but LoadPrior has {list(self.cities)}; add it to cities, or to "
+                "cities_without_prior if it shall have no voxels"
+            )
         drive = () if keys.drive is None else (_entry(results, keys.drive),)
         named = [drive_id for name in drive for drive_id in self.priors.drive_ids(city, name)]
         return Place(city, world_from_grid, (*drive, *named))
@@ -122,7 +125,7 @@ class LoadPrior:
         foreign = results.get("transformation_3d_flow")  # the names of mmdet3d's own augmentations, if any was drawn
         if foreign and keys.rotation_deg not in results:
             raise InputError(
-                f"mmdet3d augmented the sample ({foreign}), which the prior cannot follow; leave that step out, or have "
+                f"mmdet3d augmented the sample ({foreign}), which the prior cannot follow; leave that step out, or let "
                 f"it write {keys.rotation_deg!r}, {keys.scale!r}, {keys.flip_x!r} and {keys.flip_y!r}"
             )
         return BevAugmentation(

@@ -188,10 +188,10 @@ def test_without_features_a_voxel_has_four_channels(town):
     assert found(step(town, with_features=False)(results_at())).features.shape[1] == 4
 
 
-def test_only_cities_said_to_be_without_a_prior_may_be(town):
+def test_a_city_may_only_be_without_a_prior_if_the_settings_say_so(town):
     load = step(town, cities_without_prior=["village"])
     assert found(load(results_at(location="village"))).features.shape == (0, 12)
-    with pytest.raises(InputError, match="'hamlet' was not opened"):
+    with pytest.raises(InputError, match=r"in 'hamlet', but LoadPrior has \['town'\]"):
         load(results_at(location="hamlet"))
 
 
