@@ -1,7 +1,7 @@
 """The prior around each sample's vehicle as voxels: read once, cached, augmented, collated."""
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 from torch.utils.data import Dataset
 
 from presight_core.errors import InputError
@@ -65,6 +66,20 @@ class PositionNoise:
         return np.array([x, y, 0.0] if self.form == "paper" else [x, x, x])
 
 
+class PriorPoints(NamedTuple):
+    """The prior's points in a window, before augmentation."""
+
+    points_ego: NDArray[np.float32]  # (N, 3) metres
+    features: NDArray[np.uint8]  # (N, C) 255 = 1.0
+    weights: NDArray[np.float32]  # (N,) hits over the generation's mean hits: one scale for all cities
+
+    @staticmethod
+    def none(channel_count: int) -> "PriorPoints":
+        """No points, of so many channels."""
+        features = np.zeros((0, channel_count), np.uint8)
+        return PriorPoints(np.zeros((0, 3), np.float32), features, np.zeros(0, np.float32))
+
+
 @dataclass(frozen=True)
 class PriorSettings:
     """How a place becomes voxels."""
@@ -93,13 +108,11 @@ class PriorSettings:
         )
         return x, y, z
 
-
-class PriorPoints(NamedTuple):
-    """The prior's points in a window, before augmentation."""
-
-    points_ego: NDArray[np.float32]  # (N, 3) metres
-    features: NDArray[np.uint8]  # (N, C) 255 = 1.0
-    weights: NDArray[np.float32]  # (N,) hits over the generation's mean hits: one scale for all cities
+    def voxels(self, points: PriorPoints, augmentation: BevAugmentation, random: np.random.Generator) -> Voxels:
+        """The voxels of the points in `window_ranges` under an augmentation, which must lie in the settings' range."""
+        points_ego = (points.points_ego + self.noise.draw(random)) @ augmentation.matrix.T
+        voxels = voxelise(points_ego, points.features if self.with_features else None, points.weights, self.grid)
+        return voxels if self.drop is None else self.drop.apply(voxels, random)
 
     @staticmethod
     def none(channel_count: int) -> "PriorPoints":
@@ -179,15 +192,22 @@ class CityPriors:
             for city, reader in self._readers.items()
         }
 
+    def drive_ids(self, city: str, name: str) -> tuple[str, ...]:
+        """Ids of a city's drives that have this scene name; none if its prior was made without it."""
+        return tuple(drive for drive, its_name in self._reader(city).drive_names.items() if its_name == name)
+
     def points(self, place: Place, ranges: tuple[Range, Range, Range]) -> PriorPoints:
         """The prior in a box around a place. Raises InputError for a city that was not opened."""
         if place.city is None:
             return PriorPoints.none(self.channel_count)
-        if place.city not in self._readers:
-            raise InputError(f"{place.city!r} was not opened, only {sorted(self._readers)}; name it in `generations`")
-        window = self._readers[place.city].window(place.world_from_ego, *ranges, without_drives=place.without_drives)
+        window = self._reader(place.city).window(place.world_from_ego, *ranges, without_drives=place.without_drives)
         weights = (window.hits / self._mean_hits[place.city]).astype(np.float32)
         return PriorPoints(window.points_ego, window.features, weights)
+
+    def _reader(self, city: str) -> PriorReader:
+        if city not in self._readers:
+            raise InputError(f"{city!r} was not opened, only {sorted(self._readers)}; name it in `generations`")
+        return self._readers[city]
 
 
 class PriorDataset(Dataset[PriorSample]):
@@ -215,15 +235,11 @@ class PriorDataset(Dataset[PriorSample]):
 
     def voxels(self, index: int, augmentation: BevAugmentation, random: np.random.Generator) -> Voxels:
         """The voxels of one place under a given augmentation, which must lie in the settings' range."""
-        settings = self.settings
         points = self._cache.get(index)
         if points is None:
             points = self.priors.points(self._places[index], self._ranges)
             self._cache.put(index, points)
-        points_ego = (points.points_ego + settings.noise.draw(random)) @ augmentation.matrix.T
-        features = points.features if settings.with_features else None
-        voxels = voxelise(points_ego, features, points.weights, settings.grid)
-        return voxels if settings.drop is None else settings.drop.apply(voxels, random)
+        return self.settings.voxels(points, augmentation, random)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_cache": PointCache(self.settings.cache_bytes)}
@@ -234,16 +250,16 @@ class PointCache:
 
     def __init__(self, limit_bytes: int) -> None:
         self._limit_bytes = limit_bytes
-        self._entries: OrderedDict[int, PriorPoints] = OrderedDict()
+        self._entries: OrderedDict[Hashable, PriorPoints] = OrderedDict()
         self.size_bytes = 0
 
-    def get(self, key: int) -> PriorPoints | None:
+    def get(self, key: Hashable) -> PriorPoints | None:
         """What was put under a key, if it is still there."""
         if key in self._entries:
             self._entries.move_to_end(key)
         return self._entries.get(key)
 
-    def put(self, key: int, points: PriorPoints) -> None:
+    def put(self, key: Hashable, points: PriorPoints) -> None:
         """Keep points of a new key, at the cost of the least recently used ones."""
         self._entries[key] = points
         self.size_bytes += _size_bytes(points)
@@ -253,15 +269,22 @@ class PointCache:
 
 def collate(samples: Sequence[PriorSample]) -> PriorBatch:
     """One batch of samples, for a DataLoader's collate_fn."""
-    coordinates = [
-        np.pad(sample.voxels.coordinates.astype(np.int64), ((0, 0), (1, 0)), constant_values=number)
-        for number, sample in enumerate(samples)
-    ]
-    return PriorBatch(
-        torch.from_numpy(np.concatenate([sample.voxels.features for sample in samples])),
-        torch.from_numpy(np.concatenate(coordinates)),
-        torch.from_numpy(np.stack([sample.augmentation.matrix for sample in samples]).astype(np.float32)),
+    voxels, coordinates = merge(
+        [sample.voxels.features for sample in samples], [sample.voxels.coordinates for sample in samples]
     )
+    matrices = np.stack([sample.augmentation.matrix for sample in samples])
+    return PriorBatch(voxels, coordinates, torch.from_numpy(matrices.astype(np.float32)))
+
+
+def merge(
+    features: Sequence[Tensor | NDArray], coordinates: Sequence[Tensor | NDArray], device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """The voxels and coordinates of a `PriorBatch` from those of each sample, (V, 4 + C) and (V, 3) x, y, z."""
+    numbered = [
+        functional.pad(torch.as_tensor(rows, dtype=torch.int64, device=device), (1, 0), value=number)
+        for number, rows in enumerate(coordinates)
+    ]
+    return torch.cat([torch.as_tensor(rows, device=device) for rows in features]), torch.cat(numbered)
 
 
 def _turned(half: float, other_half: float, turn: float) -> float:

@@ -17,7 +17,7 @@ def publish(
 ) -> None:
     """Publish a generation of the city "town": one tile of 51 x 51 m around the world's origin, seen by 3 drives.
 
-    drive_names: scene names of its drives, drive-0 to drive-2.
+    drive_names: scene names of its drives, drive-0 to drive-2; scene-0000 and so on if not given.
     """
     example = ExampleTile(seed=seed, voxels_per_block=400)
     store = PriorStore.open(location)
@@ -25,9 +25,9 @@ def publish(
         store.create_city("town", example.lattice, "space-1", example.channel_count)
     drives = [f"drive-{number}" for number in range(example.drive_count)]
     entry = store.write_tile("town", TileName("t000", build), example.batches(), drives, {"recipe": {}})
-    store.publish(
-        "town", {"t000": GenerationTile(entry, {"stage": "test"}, {"drive_names": drive_names or {}})}, parent, TILING
-    )
+    names = drive_names or {drive: f"scene-{number:04d}" for number, drive in enumerate(drives)}
+    tile = GenerationTile(entry, {"stage": "test"}, {"drive_names": names})
+    store.publish("town", {"t000": tile}, parent, TILING)
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from presight_core.errors import InputError, NotFoundError
 from presight_core.nuscenes_split import Role
-from presight_perception.dataset import CityPriors, Place, PriorDataset, PriorSettings
+from presight_perception.dataset import CityPriors, Place, PriorDataset, PriorSettings, PriorSource
 from presight_perception.experiment.keyframes import ImageSize, Keyframe, read_images, read_keyframes
 from presight_perception.experiment.runs import PriorKind, Probe, Run, digest
+from presight_perception.lidar_history import LidarHistory
 from presight_perception.voxelise import VoxelGrid
 
 GEOMETRY_CHANNELS = 4  # of a voxel: its place and its hits
@@ -72,6 +73,12 @@ class Material:
             )
         return CityPriors(self.locations.store, generations)
 
+    @cached_property
+    def lidar_history(self) -> LidarHistory:
+        """What the lidar saw on the very drives that the priors were made from."""
+        names = {name for drives in self.priors.drive_names.values() for name in drives.values()}
+        return LidarHistory.from_tables(self.locations.data, self.locations.version, sorted(names))
+
     @property
     def digest(self) -> str:
         """Names the keyframes and how they are read; the priors' own name is `prior_digest`."""
@@ -91,20 +98,28 @@ class Material:
     def training_prior(self, run: Run, grid: VoxelGrid) -> PriorDataset:
         """The prior around the training keyframes, each without its own drive."""
         settings = PriorSettings(grid, run.prior != "geometry", drop=run.drop, cache_bytes=CACHE_BYTES, seed=run.seed)
-        return PriorDataset(self.priors, [self._place(each, own=False) for each in self.train], settings)
+        return PriorDataset(self._source(run), [self._place(run, each, own=False) for each in self.train], settings)
 
     def test_prior(self, run: Run, probe: Probe, grid: VoxelGrid) -> PriorDataset:
         """The prior around the test keyframes as a probe shows it."""
         settings = PriorSettings(grid, run.prior != "geometry", noise=probe.noise, seed=run.seed)
-        return PriorDataset(self.priors, [self._place(each, drives=probe.drives) for each in self.test], settings)
+        return PriorDataset(
+            self._source(run), [self._place(run, each, drives=probe.drives) for each in self.test], settings
+        )
 
-    def _place(self, keyframe: Keyframe, own: bool = True, drives: str = "all") -> Place:
-        names = self.priors.drive_names.get(keyframe.city, {})
+    def _source(self, run: Run) -> PriorSource:
+        return self.lidar_history if run.prior == "lidar" else self.priors
+
+    def _place(self, run: Run, keyframe: Keyframe, own: bool = True, drives: str = "all") -> Place:
+        """Where a keyframe is, with its own drive in the prior or without, and with so many of the others."""
         if keyframe.city not in self.priors.generations or drives == "none":
             return Place(None, keyframe.world_from_ego)
+        names = self.priors.drive_names[keyframe.city]
         hidden = [] if own else [drive for drive, name in names.items() if name == keyframe.scene]
         if drives == "half":
             hidden = sorted(names, key=lambda drive: names[drive])[1::2]
+        if run.prior == "lidar":  # which knows its drives by their names
+            hidden = [names[drive] for drive in hidden]
         return Place(keyframe.city, keyframe.world_from_ego, tuple(hidden))
 
     def _of_role(self, role: Role) -> list[Keyframe]:
