@@ -17,7 +17,7 @@ from presight_perception.experiment.runner import Job, Outcome, do_job, do_rows,
 from presight_perception.experiment.runs import Probe, Run, Schedule
 from presight_perception.experiment.tables import TABLES, Row, Scope, rows_of
 from presight_perception.experiment.tasks import MapTask, task_of
-from presight_perception.experiment.training import batch_rows, trained_model
+from presight_perception.experiment.training import batch_rows, begins_epoch, trained_model
 from presight_perception.experiment.trial import Trial, constant_mask_figures
 from tests.perception import toy_dataset
 from tests.perception.conftest import publish
@@ -105,8 +105,8 @@ def test_a_test_city_without_prior_is_refused_with_the_commands_that_build_it(
 def test_a_training_keyframe_does_not_see_its_own_drive_in_the_prior(material: Material) -> None:
     task = task_of("raster", material.locations.data)
     run = Run("raster", "presight", drop=type(WITH_PRIOR.drop)(greatest_share=0.0))
-    trained = material.training_prior(run, task.prior_grid)[0].voxels
-    tried = material.test_prior(run, Probe(), task.prior_grid)[0].voxels  # the same place
+    trained = material.training_prior(run, task.prior_grid)[0].voxels  # pyright: ignore - it has voxels
+    tried = material.test_prior(run, Probe(), task.prior_grid)[0].voxels  # pyright: ignore - the same place
     assert 0 < len(trained.features) < len(tried.features)
 
 
@@ -164,6 +164,22 @@ def test_an_interrupted_training_ends_as_an_uninterrupted_one(
         torch.testing.assert_close(resumed.state_dict()[name], weight)
 
 
+def test_a_model_with_a_map_of_its_own_remembers_the_prior_drives(material: Material, tmp_path: Path) -> None:
+    run, task = Run("raster", "nmp", schedule=SCHEDULE), task_of("raster", material.locations.data)
+    assert [each.scene for each in material.prior_drives(Probe())] == [toy_dataset.TRAIN_SCENE] * 4
+    model = trained_model(run, task, material, tmp_path, lambda _: None)
+    found: list[torch.Tensor] = []
+    model.decode = lambda logits: found.append(logits) or list(logits)  # pyright: ignore
+    for probe in (Probe(), Probe(drives="none")):
+        Trial(model, run, probe, task, material).found([0])
+    assert not torch.allclose(*found)
+
+
+def test_an_epoch_begins_where_all_samples_were_seen() -> None:
+    schedule = Schedule(batch_size=3)
+    assert [begins_epoch(schedule, 7, step) for step in range(6)] == [False, False, False, True, False, True]
+
+
 def test_the_best_constant_mask_is_what_all_truths_share(material: Material) -> None:
     task = task_of("raster", material.locations.data)
     assert isinstance(task, MapTask)
@@ -191,7 +207,7 @@ def test_a_job_that_is_done_is_not_done_again(locations: Locations, tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "prior"), [("stream", "geometry"), ("maptr", "none"), ("bevdet-occ", "presight")])
+@pytest.mark.parametrize(("model", "prior"), [("stream", "geometry"), ("maptr", "lidar"), ("bevdet-occ", "presight")])
 def test_every_kind_of_model_is_trained_and_tried(model, prior, locations: Locations, tmp_path: Path) -> None:
     figures = do_job(Job(Run(model, prior, schedule=SCHEDULE), (Probe(),), locations, tmp_path))[0]
     assert 0 <= figures["all"]["mean"] <= 100

@@ -68,7 +68,8 @@ def _add_sample(
         late = 0.0 if channel == "LIDAR_TOP" else LATE_M
         pose = {"token": f"{token}-{channel}", "translation": [number * STEP_M + late, 0, 0], "rotation": [1, 0, 0, 0]}
         tables["ego_pose"].append(pose)
-        file = f"samples/{channel}/{token}.jpg"
+        file = f"samples/{channel}/{token}.{'pcd.bin' if channel == 'LIDAR_TOP' else 'jpg'}"
+        (root / file).parent.mkdir(parents=True, exist_ok=True)
         tables["sample_data"].append(
             {
                 "sample_token": token,
@@ -81,9 +82,9 @@ def _add_sample(
             }
         )
         if channel == "LIDAR_TOP":
+            random.uniform(-20, 20, (500, 5)).astype("<f4").tofile(root / file)
             _write_occupancy(root / "gts" / scene / token, random)
         else:
-            (root / file).parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(root / file), random.integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3)).astype(np.uint8))
 
 

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from presight_core.errors import InputError
 from presight_core.progress import Report, silent
-from presight_perception.experiment.material import Locations, Material, spread
+from presight_perception.experiment.material import WITHOUT_VOXELS, Locations, Material, spread
 from presight_perception.experiment.pictures import (
     Panel,
     found_picture,
@@ -88,7 +88,7 @@ def write_pictures(rows: Sequence[Row], material: Material, runs: Path, folder: 
         for run, model, trial in zip(shown, models, trials, strict=True):
             caption = "without prior" if run.prior == "none" else f"with prior ({run.prior})"
             panels.append(Panel(caption, found_picture(task, model, trial.found([row])[0], keyframe)))
-        if shown[-1].prior != "none":
+        if shown[-1].prior not in WITHOUT_VOXELS:
             panels.append(Panel("prior", prior_picture(trials[-1].prior([row]), task.prior_grid)))
         files.append(folder / f"{len(files)}-{keyframe.scene}.png")
         write_strip(files[-1], panels)

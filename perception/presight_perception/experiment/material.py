@@ -6,16 +6,19 @@ from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from presight_core.errors import InputError, NotFoundError
 from presight_core.nuscenes_split import Role
 from presight_perception.dataset import CityPriors, Place, PriorDataset, PriorSettings, PriorSource
-from presight_perception.experiment.keyframes import ImageSize, Keyframe, read_images, read_keyframes
+from presight_perception.experiment.keyframes import ImageSize, Keyframe, read_images, read_keyframes, rig_of
 from presight_perception.experiment.runs import PriorKind, Probe, Run, digest
 from presight_perception.lidar_history import LidarHistory
+from presight_perception.models.camera_rig import CameraRig
 from presight_perception.voxelise import VoxelGrid
 
+WITHOUT_VOXELS: tuple[PriorKind, ...] = ("none", "nmp")
 GEOMETRY_CHANNELS = 4  # of a voxel: its place and its hits
 CACHE_BYTES = 1 << 30  # of prior windows a process: those of a thousand tiny samples
 
@@ -90,18 +93,36 @@ class Material:
         return "" if kind == "none" else digest(kind, self.priors.builds)
 
     def voxel_channels(self, kind: PriorKind) -> int | None:
-        """Channels of a prior's voxel; None without a prior."""
-        if kind == "none":
+        """Channels of a prior's voxel; None for what has no voxels."""
+        if kind in WITHOUT_VOXELS:
             return None
         return GEOMETRY_CHANNELS + (self.priors.channel_count if kind == "presight" else 0)
 
-    def training_prior(self, run: Run, grid: VoxelGrid) -> PriorDataset:
-        """The prior around the training keyframes, each without its own drive."""
+    def online(self, keyframes: Sequence[Keyframe]) -> tuple[Tensor, CameraRig]:
+        """Images (B, N, 3, H, W), 0 to 1, of some keyframes, and their rigs."""
+        images = torch.stack([self.image(keyframe.token) for keyframe in keyframes])
+        return images.float() / 255, rig_of(keyframes, self.locations.image_size)
+
+    def training_prior(self, run: Run, grid: VoxelGrid) -> PriorDataset | None:
+        """The prior's voxels around the training keyframes, each without its own drive; None if it has no voxels."""
+        if run.prior in WITHOUT_VOXELS:
+            return None
         settings = PriorSettings(grid, run.prior != "geometry", drop=run.drop, cache_bytes=CACHE_BYTES, seed=run.seed)
         return PriorDataset(self._source(run), [self._place(run, each, own=False) for each in self.train], settings)
 
-    def test_prior(self, run: Run, probe: Probe, grid: VoxelGrid) -> PriorDataset:
-        """The prior around the test keyframes as a probe shows it."""
+    def prior_drives(self, probe: Probe) -> list[Keyframe]:
+        """The keyframes that the test cities' priors were made from, as far as a probe shows them."""
+        cities = {keyframe.city for keyframe in self.test}
+        return [
+            keyframe
+            for keyframe in self.keyframes
+            if keyframe.city in cities and keyframe.scene in self._names(keyframe.city, probe.drives)
+        ]
+
+    def test_prior(self, run: Run, probe: Probe, grid: VoxelGrid) -> PriorDataset | None:
+        """The prior's voxels around the test keyframes as a probe shows it; None if it has no voxels."""
+        if run.prior in WITHOUT_VOXELS:
+            return None
         settings = PriorSettings(grid, run.prior != "geometry", noise=probe.noise, seed=run.seed)
         return PriorDataset(
             self._source(run), [self._place(run, each, drives=probe.drives) for each in self.test], settings
@@ -115,12 +136,16 @@ class Material:
         if keyframe.city not in self.priors.generations or drives == "none":
             return Place(None, keyframe.world_from_ego)
         names = self.priors.drive_names[keyframe.city]
-        hidden = [] if own else [drive for drive, name in names.items() if name == keyframe.scene]
-        if drives == "half":
-            hidden = sorted(names, key=lambda drive: names[drive])[1::2]
+        shown = self._names(keyframe.city, drives)
+        hidden = [drive for drive, name in names.items() if name not in shown or (name == keyframe.scene and not own)]
         if run.prior == "lidar":  # which knows its drives by their names
             hidden = [names[drive] for drive in hidden]
         return Place(keyframe.city, keyframe.world_from_ego, tuple(hidden))
+
+    def _names(self, city: str, drives: str) -> list[str]:
+        """Scene names of all, every second or none of the drives in a city's prior."""
+        names = sorted(set(self.priors.drive_names[city].values()))
+        return {"all": names, "half": names[::2], "none": []}[drives]
 
     def _of_role(self, role: Role) -> list[Keyframe]:
         chosen = [keyframe for keyframe in self.keyframes if keyframe.role == role]

@@ -9,7 +9,8 @@ from presight_perception.dataset import PositionNoise
 from presight_perception.voxelise import VoxelDrop
 
 ModelName = Literal["raster", "stream", "maptr", "bevdet-occ", "fb-occ"]
-PriorKind = Literal["none", "presight", "geometry", "lidar"]  # geometry: ours without features
+# geometry: ours without features; nmp: Neural Map Prior, of the raster model alone
+PriorKind = Literal["none", "presight", "geometry", "lidar", "nmp"]
 MAP_MODELS: tuple[ModelName, ...] = ("raster", "stream", "maptr")
 OCCUPANCY_MODELS: tuple[ModelName, ...] = ("bevdet-occ", "fb-occ")
 

@@ -9,13 +9,14 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from presight_core.progress import Progress, Report
-from presight_perception.dataset import PriorBatch, collate
-from presight_perception.experiment.keyframes import rig_of
+from presight_perception.dataset import collate
+from presight_perception.experiment.map_memory import MapMemory
 from presight_perception.experiment.material import Material
 from presight_perception.experiment.runs import Run, Schedule
 from presight_perception.experiment.tasks import MODELS, Task
 from presight_perception.models.bev_features import Sources
-from presight_perception.models.camera_rig import CameraRig
+from presight_perception.models.nmp_raster_mapper import NmpRasterMapper
+from presight_perception.models.raster_mapper import RasterMapperSettings
 
 CHECKPOINT_STEPS = 100  # a minute or two of work at most is done again
 REPORT_STEPS = 10
@@ -26,6 +27,8 @@ WARM_UP = 0.15  # of the steps
 def build_model(run: Run, material: Material) -> nn.Module:
     """The untrained model of a run, the same one for the same seed."""
     torch.manual_seed(run.seed)
+    if run.prior == "nmp":
+        return NmpRasterMapper(RasterMapperSettings.tiny())
     return MODELS[run.model](Sources(run.cameras, material.voxel_channels(run.prior)))
 
 
@@ -52,13 +55,16 @@ class _Training:
         self._rate = torch.optim.lr_scheduler.OneCycleLR(
             self._optimizer, schedule.learning_rate, total_steps=schedule.steps, pct_start=WARM_UP
         )
-        self._prior = None if run.prior == "none" else material.training_prior(run, task.prior_grid)
+        self._prior = material.training_prior(run, task.prior_grid)
+        self._memory = MapMemory(model) if isinstance(model, NmpRasterMapper) else None
 
     def go(self, report: Report) -> None:
         """All steps that are left."""
         losses: list[float] = []
         self._model.train()
         for step in range(self._resume(), self._run.schedule.steps):
+            if self._memory is not None and begins_epoch(self._run.schedule, len(self._material.train), step):
+                self._memory.clear()
             losses.append(self._step(batch_rows(self._run.schedule, self._run.seed, len(self._material.train), step)))
             done = step + 1
             if done % REPORT_STEPS == 0 or done == self._run.schedule.steps:
@@ -68,9 +74,8 @@ class _Training:
                 self._keep(done)
 
     def _step(self, rows: list[int]) -> float:
-        images, rig, prior = self._inputs(rows)
         truths = [self._task.truth(self._model, self._material.train[row]) for row in rows]
-        losses: dict[str, Tensor] = self._model.loss(self._model(images, rig, prior), truths)  # pyright: ignore
+        losses: dict[str, Tensor] = self._model.loss(self._predictions(rows), truths)  # pyright: ignore
         loss = torch.stack(list(losses.values())).sum()
         self._optimizer.zero_grad()
         loss.backward()
@@ -79,13 +84,13 @@ class _Training:
         self._rate.step()
         return loss.item()
 
-    def _inputs(self, rows: list[int]) -> tuple[Tensor | None, CameraRig | None, PriorBatch | None]:
-        prior = collate([self._prior[row] for row in rows]) if self._prior is not None else None
-        if not self._run.cameras:
-            return None, None, prior
+    def _predictions(self, rows: list[int]) -> Any:
         keyframes = [self._material.train[row] for row in rows]
-        images = torch.stack([self._material.image(keyframe.token) for keyframe in keyframes])
-        return images.float() / 255, rig_of(keyframes, self._material.locations.image_size), prior
+        images, rig = self._material.online(keyframes) if self._run.cameras else (None, None)
+        if self._memory is not None and images is not None and rig is not None:
+            return self._memory.predict(images, rig, keyframes, remember=True)
+        prior = collate([self._prior[row] for row in rows]) if self._prior is not None else None
+        return self._model(images, rig, prior)
 
     def _resume(self) -> int:
         """The step to go on with."""
@@ -117,6 +122,12 @@ def batch_rows(schedule: Schedule, seed: int, count: int, step: int) -> list[int
         epoch, rank = divmod(place, count)
         rows.append(int(np.random.default_rng([seed, epoch]).permutation(count)[rank]))
     return rows
+
+
+def begins_epoch(schedule: Schedule, count: int, step: int) -> bool:
+    """Whether the step before this one ended an epoch."""
+    places = step * schedule.batch_size
+    return places // count > max(places - schedule.batch_size, 0) // count
 
 
 def _write_whole(file: Path, write: Any) -> None:

@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from presight_core.progress import Progress, Report, silent
 from presight_perception.dataset import PriorBatch, PriorSample, collate
-from presight_perception.experiment.keyframes import Keyframe, rig_of
+from presight_perception.experiment.keyframes import Keyframe
+from presight_perception.experiment.map_memory import MapMemory
 from presight_perception.experiment.material import Material
 from presight_perception.experiment.runs import Probe, Run
 from presight_perception.experiment.tasks import Figures, MapTask, MaskScorer, Scorer, Task
-from presight_perception.models.camera_rig import CameraRig
+from presight_perception.models.nmp_raster_mapper import NmpRasterMapper
 from presight_perception.models.raster_mapper import RasterMapperSettings
 from presight_perception.voxelise import BevAugmentation
 
@@ -29,7 +30,11 @@ class Trial:
     def __init__(self, model: nn.Module, run: Run, probe: Probe, task: Task, material: Material) -> None:
         self._model, self._run, self._probe = model, run, probe
         self._task, self._material = task, material
-        self._prior = None if run.prior == "none" else material.test_prior(run, probe, task.prior_grid)
+        self._prior = material.test_prior(run, probe, task.prior_grid)
+        self._memory = None
+        if isinstance(model, NmpRasterMapper):
+            self._memory = MapMemory(model)
+            self._memory.drive(material.prior_drives(probe), material)
 
     def figures(self, report: Report = silent) -> dict[str, Figures]:
         """Figures over all test keyframes, and over those by night and by day."""
@@ -44,10 +49,8 @@ class Trial:
 
     def found(self, rows: Sequence[int]) -> Sequence[Any]:
         """What the model finds in some test keyframes, decoded."""
-        images, rig = self._images(rows) if self._run.cameras and self._probe.cameras else (None, None)
-        prior = None if self._prior is None else self.prior(rows)
         with torch.inference_mode():
-            return self._model.decode(self._model(images, rig, prior))  # pyright: ignore[reportCallIssue]
+            return self._model.decode(self._predictions(rows))  # pyright: ignore[reportCallIssue]
 
     def prior(self, rows: Sequence[int]) -> PriorBatch:
         """The prior around some test keyframes. Only for runs with one."""
@@ -58,10 +61,13 @@ class Trial:
         draws = np.random.default_rng(0)  # of noise, which such a probe has none of
         return collate([PriorSample(self._prior.voxels(row, mirror, draws), straight) for row in rows])
 
-    def _images(self, rows: Sequence[int]) -> tuple[Tensor, CameraRig]:
+    def _predictions(self, rows: Sequence[int]) -> Any:
         keyframes = [self._material.test[row] for row in rows]
-        images = torch.stack([self._material.image(keyframe.token) for keyframe in keyframes])
-        return images.float() / 255, rig_of(keyframes, self._material.locations.image_size)
+        online = self._run.cameras and self._probe.cameras
+        images, rig = self._material.online(keyframes) if online else (None, None)
+        if self._memory is not None and images is not None and rig is not None:
+            return self._memory.predict(images, rig, keyframes, remember=False)
+        return self._model(images, rig, None if self._prior is None else self.prior(rows))
 
 
 def constant_mask_figures(task: MapTask, material: Material) -> dict[str, Figures]:
