@@ -79,7 +79,7 @@ class Material:
     @cached_property
     def lidar_history(self) -> LidarHistory:
         """What the lidar saw on the very drives that the priors were made from."""
-        names = {name for drives in self.priors.drive_names.values() for name in drives.values()}
+        names = {name for drives in self.priors.drive_names.values() for name in drives.values() if name}
         return LidarHistory.from_tables(self.locations.data, self.locations.version, sorted(names))
 
     @property

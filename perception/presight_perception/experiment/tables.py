@@ -73,10 +73,9 @@ def priors(scope: Scope) -> list[Row]:
     """Table 3: kinds of prior."""
     model = scope.model or "raster"
     names: dict[PriorKind, str] = {"none": "no prior", "lidar": "lidar history"}
-    names |= (
-        {"nmp": "Neural Map Prior"} if model == "raster" else {}
-    )  # it is of the raster model alone, as in the paper
-    names |= {"presight": "PreSight"}
+    if model == "raster":  # the only one it is for, as in the paper
+        names["nmp"] = "Neural Map Prior"
+    names["presight"] = "PreSight"
     return [row for kind, name in names.items() for row in scope.rows(f"{model}, {name}", model, kind)]
 
 
