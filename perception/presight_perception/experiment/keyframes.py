@@ -1,82 +1,25 @@
 """Keyframes of a data set in nuScenes format: six images, their rig, and where the vehicle is."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
 
 import cv2
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from presight_core import frames
 from presight_core.errors import InputError
 from presight_core.nuscenes_split import Role, role_of
-from presight_core.table import read_table
 from presight_perception.models.camera_rig import CameraRig
+from presight_perception.nuscenes_tables import FileRow, NuscenesTables, PoseRow, Rows
 
 # nuScenes' six, clockwise from the front left.
 CAMERAS = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT")
 CLOCK = "LIDAR_TOP"  # a sample is where the vehicle was when this sensor fired
 STAND_IN_CLOCK = "CAM_FRONT"  # where there is no lidar
-
-Token = Annotated[str, msgspec.Meta(min_length=1)]
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]  # w, x, y, z
-
-
-class _Log(msgspec.Struct):
-    token: Token
-    location: str
-
-
-class _Scene(msgspec.Struct):
-    token: Token
-    log_token: Token
-    name: str
-    description: str = ""
-
-
-class _Sample(msgspec.Struct):
-    token: Token
-    scene_token: Token
-    timestamp: int
-
-
-class _Sensor(msgspec.Struct):
-    token: Token
-    channel: str
-
-
-class _Mounting(msgspec.Struct):
-    token: Token
-    sensor_token: Token
-    translation: Vector
-    rotation: Quaternion
-    camera_intrinsic: list[list[float]] = []
-
-
-class _Pose(msgspec.Struct, gc=False):
-    token: Token
-    translation: Vector
-    rotation: Quaternion
-
-
-class _File(msgspec.Struct, gc=False):
-    sample_token: Token
-    ego_pose_token: Token
-    calibrated_sensor_token: Token
-    is_key_frame: bool
-    filename: str
-    width: int = 0
-    height: int = 0
-
-
-Row = TypeVar("Row", bound=msgspec.Struct)
-Linked = TypeVar("Linked")
 
 
 @dataclass(frozen=True)
@@ -119,11 +62,13 @@ def read_keyframes(root: Path, version: str) -> list[Keyframe]:
     Raises InputError, naming the file, for tables that are missing, damaged or contradict each other, and where no
     sample has all cameras.
     """
-    tables = _Tables(Path(root), Path(root) / version)
-    files = tables.files()
-    poses = tables.poses({file.ego_pose_token for channels in files.values() for file in channels.values()})
+    tables = NuscenesTables(root, version)
+    files = tables.keyframe_files()
+    poses = tables.poses(row for channels in files.values() for row in channels.values())
     keyframes = [
-        tables.keyframe(token, channels, poses) for token, channels in files.items() if set(CAMERAS) <= channels.keys()
+        _keyframe(tables, poses, token, channels)
+        for token, channels in files.items()
+        if set(CAMERAS) <= channels.keys()
     ]
     if not keyframes:
         raise InputError(f"{tables.folder}: no sample has the images of all six cameras; are these nuScenes' tables?")
@@ -152,74 +97,25 @@ def rig_of(keyframes: Sequence[Keyframe], size: ImageSize) -> CameraRig:
     return CameraRig(torch.from_numpy(intrinsics).float(), torch.from_numpy(mounted).float())
 
 
-class _Tables:
-    """The tables of one folder, joined by token."""
-
-    def __init__(self, root: Path, folder: Path) -> None:
-        self._root, self.folder = root, folder
-        self._logs, self._scenes = self._by_token("log", _Log), self._by_token("scene", _Scene)
-        self._samples, self._sensors = self._by_token("sample", _Sample), self._by_token("sensor", _Sensor)
-        self._mountings = self._by_token("calibrated_sensor", _Mounting)
-
-    def files(self) -> dict[str, dict[str, _File]]:
-        """The files of every sample by channel."""
-        files: dict[str, dict[str, _File]] = {}
-        for block in read_table(self.folder / "sample_data.json", _File):
-            for row in (row for row in block if row.is_key_frame):
-                mounting = self._linked(
-                    "sample_data", self._mountings, row.calibrated_sensor_token, "calibrated_sensor"
-                )
-                sensor = self._linked("calibrated_sensor", self._sensors, mounting.sensor_token, "sensor")
-                files.setdefault(row.sample_token, {})[sensor.channel] = row
-        return files
-
-    def poses(self, wanted: set[str]) -> dict[str, NDArray[np.float64]]:
-        """`world_from_ego` (4, 4) of the wanted tokens."""
-        blocks = read_table(self.folder / "ego_pose.json", _Pose)
-        return {row.token: _matrix(row) for block in blocks for row in block if row.token in wanted}
-
-    def keyframe(self, token: str, channels: dict[str, _File], poses: dict[str, NDArray[np.float64]]) -> Keyframe:
-        """One sample, joined."""
-        sample = self._linked("sample_data", self._samples, token, "sample")
-        scene = self._linked("sample", self._scenes, sample.scene_token, "scene")
-        world_from_ego_then = {
-            channel: self._linked("sample_data", poses, file.ego_pose_token, "ego_pose")
-            for channel, file in channels.items()
-        }
-        world_from_ego = world_from_ego_then.get(CLOCK, world_from_ego_then[STAND_IN_CLOCK])
-        ego_from_world = np.linalg.inv(world_from_ego)
-        mounted = {camera: self._mountings[channels[camera].calibrated_sensor_token] for camera in CAMERAS}
-        first = channels[CAMERAS[0]]
-        return Keyframe(
-            token=token,
-            scene=scene.name,
-            city=self._linked("scene", self._logs, scene.log_token, "log").location,
-            description=scene.description,
-            timestamp_us=sample.timestamp,
-            world_from_ego=world_from_ego,
-            images=tuple(self._root / channels[camera].filename for camera in CAMERAS),
-            image_size=ImageSize(first.height, first.width),
-            intrinsics=np.array([row.camera_intrinsic for row in mounted.values()], np.float64),
-            ego_from_camera=np.stack(
-                [ego_from_world @ world_from_ego_then[camera] @ _matrix(row) for camera, row in mounted.items()]
-            ),
-        )
-
-    def _by_token(self, table: str, row_type: type[Row]) -> dict[str, Row]:
-        blocks: Iterable[list[Any]] = read_table(self.folder / f"{table}.json", row_type)
-        return {row.token: row for block in blocks for row in block}
-
-    def _linked(self, table: str, rows: dict[str, Linked], token: str, target: str) -> Linked:
-        if token not in rows:
-            raise InputError(
-                f"{self.folder / table}.json: {token!r} is not in {target}.json; take both tables from the same archive"
-            )
-        return rows[token]
-
-
-def _matrix(row: _Pose | _Mounting) -> NDArray[np.float64]:
-    w, x, y, z = row.rotation
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-    matrix[:3, 3] = row.translation
-    return matrix
+def _keyframe(tables: NuscenesTables, poses: Rows[PoseRow], token: str, channels: dict[str, FileRow]) -> Keyframe:
+    """One sample, joined."""
+    scene = tables.scene_of(token)
+    world_from_ego_then = {channel: poses[row.ego_pose_token].transform for channel, row in channels.items()}
+    world_from_ego = world_from_ego_then.get(CLOCK, world_from_ego_then[STAND_IN_CLOCK])
+    ego_from_world = frames.invert(world_from_ego)
+    mounted = {camera: tables.calibrations[channels[camera].calibrated_sensor_token] for camera in CAMERAS}
+    first = channels[CAMERAS[0]]
+    return Keyframe(
+        token=token,
+        scene=scene.name,
+        city=tables.city_of(scene),
+        description=scene.description,
+        timestamp_us=tables.samples[token].timestamp,
+        world_from_ego=world_from_ego,
+        images=tuple(tables.root / channels[camera].filename for camera in CAMERAS),
+        image_size=ImageSize(first.height, first.width),
+        intrinsics=np.array([row.camera_intrinsic for row in mounted.values()], np.float64),
+        ego_from_camera=np.stack(
+            [ego_from_world @ world_from_ego_then[camera] @ row.transform for camera, row in mounted.items()]
+        ),
+    )

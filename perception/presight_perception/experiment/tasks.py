@@ -16,8 +16,10 @@ from presight_perception.map_truth import MapLines, MapTruthSettings, VectorMap,
 from presight_perception.metrics import (
     OccupancyIou,
     RasterIou,
+    RasterScores,
     ScoredLines,
     VectorPrecision,
+    VectorScores,
     VectorSettings,
 )
 from presight_perception.models.bev_features import TINY_GRID, Sources
@@ -111,8 +113,7 @@ class MaskScorer(Scorer):
         self._scores.add(found, self.true_masks(keyframe))
 
     def result(self) -> Figures:
-        scores = self._scores.result()
-        return {name: 100 * value for name, value in {"mean": scores.mean, **scores.per_class}.items()}
+        return _percent(self._scores.result())
 
 
 class LineScorer(Scorer):
@@ -126,8 +127,11 @@ class LineScorer(Scorer):
         self._scores.add(found, self._task.lines(keyframe))
 
     def result(self) -> Figures:
-        scores = self._scores.result()
-        return {name: 100 * value for name, value in {"mean": scores.mean, **scores.per_class}.items()}
+        return _percent(self._scores.result())
+
+
+def _percent(scores: RasterScores | VectorScores) -> Figures:
+    return {name: 100 * value for name, value in {"mean": scores.mean, **scores.per_class}.items()}
 
 
 class OccupancyTask(Task):
