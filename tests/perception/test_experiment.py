@@ -206,6 +206,18 @@ def test_a_job_that_is_done_is_not_done_again(locations: Locations, tmp_path: Pa
     assert {file.suffix for file in before} == {".safetensors", ".json"}  # no checkpoint, no word of progress is left
 
 
+def test_a_job_ends_when_nobody_waits_for_it(
+    locations: Locations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Dead:
+        def is_alive(self) -> bool:
+            return False
+
+    monkeypatch.setattr("multiprocessing.parent_process", Dead)
+    with pytest.raises(SystemExit):
+        do_job(Job(WITH_PRIOR, (Probe(),), locations, tmp_path))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "prior"), [("stream", "geometry"), ("maptr", "lidar"), ("bevdet-occ", "presight")])
 def test_every_kind_of_model_is_trained_and_tried(model, prior, locations: Locations, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ and a broken-off experiment goes on where it was.
 
 import json
 import multiprocessing
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -108,6 +109,11 @@ class _Follow:
         self._file, self._run = file, run
 
     def tell(self, progress: Progress) -> None:
+        parent = multiprocessing.parent_process()
+        if (
+            parent is not None and not parent.is_alive()
+        ):  # killed: nobody waits, and a new experiment may be at this run
+            sys.exit(1)
         self._file.parent.mkdir(parents=True, exist_ok=True)
         _write_json(self._file, asdict(progress))
 
