@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 from presight_core.errors import InputError
 from presight_perception.dataset import PositionNoise
-from presight_perception.experiment.keyframes import ImageSize, read_images, read_keyframes, rig_of
+from presight_perception.experiment.keyframes import ImageSize, lidar_depth, read_images, read_keyframes, rig_of
 from presight_perception.experiment.material import Locations, Material
 from presight_perception.experiment.report import table_of, write_report
 from presight_perception.experiment.runner import Job, Outcome, do_job, do_rows, run_folder
@@ -103,7 +104,7 @@ def test_a_test_city_without_prior_is_refused_with_the_commands_that_build_it(
 
 
 def test_a_training_keyframe_does_not_see_its_own_drive_in_the_prior(material: Material) -> None:
-    task = task_of("raster", material.locations.data)
+    task = task_of("raster", material.locations)
     run = Run("raster", "presight", drop=type(WITH_PRIOR.drop)(greatest_share=0.0))
     trained = material.training_prior(run, task.prior_grid)[0].voxels  # pyright: ignore - it has voxels
     tried = material.test_prior(run, Probe(), task.prior_grid)[0].voxels  # pyright: ignore - the same place
@@ -111,7 +112,7 @@ def test_a_training_keyframe_does_not_see_its_own_drive_in_the_prior(material: M
 
 
 def test_probes_show_what_they_say_of_the_prior(material: Material) -> None:
-    task = task_of("raster", material.locations.data)
+    task = task_of("raster", material.locations)
 
     def voxels(probe: Probe) -> torch.Tensor:
         return Trial(torch.nn.Identity(), WITH_PRIOR, probe, task, material).prior([0, 1]).coordinates
@@ -126,7 +127,7 @@ def test_probes_show_what_they_say_of_the_prior(material: Material) -> None:
 
 
 def test_zeroed_cameras_change_what_a_model_finds(material: Material) -> None:
-    task = task_of("raster", material.locations.data)
+    task = task_of("raster", material.locations)
     model = trained_model(WITH_PRIOR, task, material, material.locations.data / "run", lambda _: None)
     heads = [Trial(model, WITH_PRIOR, Probe(cameras=cameras), task, material) for cameras in (True, False)]
     logits = []
@@ -134,6 +135,29 @@ def test_zeroed_cameras_change_what_a_model_finds(material: Material) -> None:
     for trial in heads:
         trial.found([0])
     assert not torch.allclose(*logits)
+
+
+def test_lidar_returns_lie_on_the_pixels_that_see_them(material: Material, tmp_path: Path) -> None:
+    keyframe = material.train[0]
+    assert keyframe.sweep is not None
+    ego_from_lidar = keyframe.sweep.ego_from_lidar
+    ahead = np.linalg.inv(ego_from_lidar) @ [10.5, -0.1, 1.4, 1.0]  # ego; the cameras are half a metre farther on
+    file = tmp_path / "sweep.pcd.bin"
+    behind = np.linalg.inv(ego_from_lidar) @ [20.5, -0.2, 1.3, 1.0]  # on the same pixel
+    np.array([[*behind[:3], 0, 0], [*ahead[:3], 0, 0]], "<f4").tofile(file)
+    depth = lidar_depth(replace(keyframe, sweep=replace(keyframe.sweep, file=file)), SIZE)
+    assert depth is not None
+    assert np.flatnonzero(depth[1]).tolist() == [16 * 64 + 32]  # of the front camera: next to the middle
+    np.testing.assert_allclose(depth[1, 16, 32], 10.0, atol=1e-5)
+    assert not depth[4].any()  # the back camera's
+
+
+def test_an_occupancy_model_is_given_the_keyframe_before(material: Material) -> None:
+    task = task_of("bevdet-occ", material.locations)
+    (past,) = task.more_inputs(material.train[:2], material)["history"]
+    np.testing.assert_allclose(past.past_from_now[:, 0, 3], [0.0, toy_dataset.STEP_M])  # the first has none before
+    np.testing.assert_allclose(past.age_s, [0.0, 0.5])
+    torch.testing.assert_close(past.images[1], material.online(material.train[:1])[0][0])
 
 
 def test_every_epoch_sees_each_sample_once_in_another_order() -> None:
@@ -148,7 +172,7 @@ def test_an_interrupted_training_ends_as_an_uninterrupted_one(
 ) -> None:
     monkeypatch.setattr("presight_perception.experiment.training.CHECKPOINT_STEPS", 1)
     monkeypatch.setattr("presight_perception.experiment.training.REPORT_STEPS", 1)
-    task = task_of("raster", material.locations.data)
+    task = task_of("raster", material.locations)
 
     def stop(progress) -> None:
         if progress.done == 3:
@@ -165,7 +189,7 @@ def test_an_interrupted_training_ends_as_an_uninterrupted_one(
 
 
 def test_a_model_with_a_map_of_its_own_remembers_the_prior_drives(material: Material, tmp_path: Path) -> None:
-    run, task = Run("raster", "nmp", schedule=SCHEDULE), task_of("raster", material.locations.data)
+    run, task = Run("raster", "nmp", schedule=SCHEDULE), task_of("raster", material.locations)
     assert [each.scene for each in material.prior_drives(Probe())] == [toy_dataset.TRAIN_SCENE] * 4
     model = trained_model(run, task, material, tmp_path, lambda _: None)
     found: list[torch.Tensor] = []
@@ -181,7 +205,7 @@ def test_an_epoch_begins_where_all_samples_were_seen() -> None:
 
 
 def test_the_best_constant_mask_is_what_all_truths_share(material: Material) -> None:
-    task = task_of("raster", material.locations.data)
+    task = task_of("raster", material.locations)
     assert isinstance(task, MapTask)
     figures = constant_mask_figures(task, material)
     assert 20 < figures["all"]["mean"] < 100  # the drives pass the same crossroads, a little apart

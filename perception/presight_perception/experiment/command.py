@@ -75,7 +75,7 @@ def write_pictures(rows: Sequence[Row], material: Material, runs: Path, folder: 
     shown = _shown(rows)
     if not shown:
         return []
-    task = task_of(shown[0].model, material.locations.data)
+    task = task_of(shown[0].model, material.locations)
     models = [trained_model(run, task, material, run_folder(run, material, runs), silent) for run in shown]
     trials = [Trial(model, run, Probe(), task, material) for model, run in zip(models, shown, strict=True)]
     files = []

@@ -13,12 +13,13 @@ from torch import Tensor
 from presight_core import frames
 from presight_core.errors import InputError
 from presight_core.nuscenes_split import Role, role_of
-from presight_perception.models.camera_rig import CameraRig
-from presight_perception.nuscenes_tables import FileRow, NuscenesTables, PoseRow, Rows
+from presight_perception.lidar_sweeps import CHANNEL, Sweep
+from presight_perception.models.camera_rig import LEAST_DEPTH_M, CameraRig
+from presight_perception.nuscenes_tables import FileRow, NuscenesTables, PoseRow, Rows, SceneRow
 
 # nuScenes' six, clockwise from the front left.
 CAMERAS = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT")
-CLOCK = "LIDAR_TOP"  # a sample is where the vehicle was when this sensor fired
+CLOCK = CHANNEL  # a sample is where the vehicle was when the lidar fired
 STAND_IN_CLOCK = "CAM_FRONT"  # where there is no lidar
 
 
@@ -44,6 +45,7 @@ class Keyframe:
     image_size: ImageSize  # of the files
     intrinsics: NDArray[np.float64]  # (N, 3, 3) in their pixels
     ego_from_camera: NDArray[np.float64]  # (N, 4, 4) from where each image was taken to the ego at the lidar's time
+    sweep: Sweep | None  # of the lidar, if there is one
 
     @property
     def role(self) -> Role:
@@ -97,6 +99,28 @@ def rig_of(keyframes: Sequence[Keyframe], size: ImageSize) -> CameraRig:
     return CameraRig(torch.from_numpy(intrinsics).float(), torch.from_numpy(mounted).float())
 
 
+def lidar_depth(keyframe: Keyframe, size: ImageSize) -> Tensor | None:
+    """Depths (N, H, W) of the lidar's returns along the cameras' axes, metres, the nearest of a pixel; else 0."""
+    if keyframe.sweep is None:
+        return None
+    points, rig = keyframe.sweep.points_ego(), rig_of([keyframe], size)
+    depth = np.full((len(keyframe.images), size.height_px, size.width_px), np.inf, np.float32)
+    for picture, ego_from_camera, intrinsics in zip(
+        depth, keyframe.ego_from_camera, rig.intrinsics[0].numpy(), strict=True
+    ):
+        points_camera = frames.apply(frames.invert(ego_from_camera), points)
+        points_camera = points_camera[points_camera[:, 2] > LEAST_DEPTH_M]
+        column, row = np.floor((points_camera @ intrinsics.T)[:, :2] / points_camera[:, 2:]).astype(int).T
+        seen = (column >= 0) & (column < size.width_px) & (row >= 0) & (row < size.height_px)
+        np.minimum.at(picture, (row[seen], column[seen]), points_camera[seen, 2])
+    return torch.from_numpy(np.where(np.isinf(depth), 0, depth))
+
+
+def _sweep(tables: NuscenesTables, scene: SceneRow, row: FileRow, world_from_ego: NDArray[np.float64]) -> Sweep:
+    ego_from_lidar = tables.calibrations[row.calibrated_sensor_token].transform
+    return Sweep(scene.name, tables.city_of(scene), tables.root / row.filename, ego_from_lidar, world_from_ego)
+
+
 def _keyframe(tables: NuscenesTables, poses: Rows[PoseRow], token: str, channels: dict[str, FileRow]) -> Keyframe:
     """One sample, joined."""
     scene = tables.scene_of(token)
@@ -118,4 +142,5 @@ def _keyframe(tables: NuscenesTables, poses: Rows[PoseRow], token: str, channels
         ego_from_camera=np.stack(
             [ego_from_world @ world_from_ego_then[camera] @ row.transform for camera, row in mounted.items()]
         ),
+        sweep=_sweep(tables, scene, channels[CLOCK], world_from_ego) if CLOCK in channels else None,
     )

@@ -103,6 +103,12 @@ class Material:
         images = torch.stack([self.image(keyframe.token) for keyframe in keyframes])
         return images.float() / 255, rig_of(keyframes, self.locations.image_size)
 
+    def earlier(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe before, of the same scene; of the first one, itself."""
+        row = self._row_of[keyframe.token]
+        before = self.keyframes[row - 1]
+        return before if row and before.scene == keyframe.scene else keyframe
+
     def training_prior(self, run: Run, grid: VoxelGrid) -> PriorDataset | None:
         """The prior's voxels around the training keyframes, each without its own drive; None if it has no voxels."""
         if run.prior in WITHOUT_VOXELS:
@@ -157,11 +163,11 @@ class Material:
         return chosen
 
     def _image(self, token: str) -> Tensor:
-        return read_images(self._by_token[token], self.locations.image_size)
+        return read_images(self.keyframes[self._row_of[token]], self.locations.image_size)
 
     @cached_property
-    def _by_token(self) -> dict[str, Keyframe]:
-        return {keyframe.token: keyframe for keyframe in self.keyframes}
+    def _row_of(self) -> dict[str, int]:
+        return {keyframe.token: row for row, keyframe in enumerate(self.keyframes)}
 
 
 def spread(keyframes: Sequence[Keyframe], count: int) -> list[int]:

@@ -70,11 +70,11 @@ def do_job(job: Job) -> list[dict[str, Figures]]:
     torch.set_num_threads(1)  # runs side by side make better use of processors than threads within one
     material = material_of(job.locations)
     if job.run is None:
-        task = task_of("raster", job.locations.data)
+        task = task_of("raster", job.locations)
         assert isinstance(task, MapTask)
         return [constant_mask_figures(task, material) for _ in job.probes]
     folder = run_folder(job.run, material, job.folder)
-    task = task_of(job.run.model, job.locations.data)
+    task = task_of(job.run.model, job.locations)
     follow = _Follow(folder / "progress.json", job.run)
     model = trained_model(job.run, task, material, folder, follow.tell)
     found = []

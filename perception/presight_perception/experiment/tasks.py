@@ -1,16 +1,18 @@
 """What a model is for and how it is judged: lines, masks, or classes of voxels."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from presight_perception.experiment.keyframes import Keyframe
+from presight_perception.experiment.keyframes import Keyframe, lidar_depth
+from presight_perception.experiment.material import Locations, Material
 from presight_perception.experiment.runs import MAP_MODELS, ModelName
 from presight_perception.map_truth import MapLines, MapTruthSettings, VectorMap, rasterise
 from presight_perception.metrics import (
@@ -26,6 +28,7 @@ from presight_perception.models.bev_features import TINY_GRID, Sources
 from presight_perception.models.bevdet_occ import BevDetOcc, BevDetOccSettings
 from presight_perception.models.fb_occ import FbOcc, FbOccSettings
 from presight_perception.models.map_tr import MapTr, MapTrSettings
+from presight_perception.models.occ_frames import PastFrame
 from presight_perception.models.occ_model import OccupancyModel
 from presight_perception.models.raster_mapper import RasterMapper, RasterMapperSettings
 from presight_perception.models.stream_map_net import StreamMapNet, StreamMapNetSettings
@@ -64,14 +67,18 @@ class Task(ABC):
     def truth(self, model: Any, keyframe: Keyframe) -> Any:
         """What the model's loss compares with."""
 
+    def more_inputs(self, keyframes: Sequence[Keyframe], material: Material) -> dict[str, Any]:
+        """What a model with cameras is given besides images, rig and prior, by the argument's name."""
+        return {}
+
     @abstractmethod
     def scorer(self, model: Any) -> Scorer:
         """A new scorer of what the model decodes."""
 
 
-def task_of(name: ModelName, root: Path) -> Task:
-    """The task of a model, on the data set at `root`."""
-    return MapTask(root) if name in MAP_MODELS else OccupancyTask(root)
+def task_of(name: ModelName, locations: Locations) -> Task:
+    """The task of a model, on a data set."""
+    return MapTask(locations.data) if name in MAP_MODELS else OccupancyTask(locations)
 
 
 class MapTask(Task):
@@ -135,10 +142,10 @@ def _percent(scores: RasterScores | VectorScores) -> Figures:
 
 
 class OccupancyTask(Task):
-    """Classes of voxels, 20 m around, of those that a camera saw."""
+    """Classes of voxels, 20 m around, of those that a camera saw; from this keyframe's images and those before."""
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, locations: Locations) -> None:
+        self._root, self._size = locations.data, locations.image_size
         self.prior_grid = BevDetOccSettings.tiny().prior_grid
 
     def occupancy(self, keyframe: Keyframe) -> OccupancyTruth:
@@ -146,7 +153,14 @@ class OccupancyTask(Task):
         return read_occupancy(self._root, keyframe.scene, keyframe.token)
 
     def truth(self, model: OccupancyModel, keyframe: Keyframe) -> Any:
-        return model.truth_of(self.occupancy(keyframe))
+        return model.truth_of(self.occupancy(keyframe), lidar_depth(keyframe, self._size))
+
+    def more_inputs(self, keyframes: Sequence[Keyframe], material: Material) -> dict[str, Any]:
+        earlier = [material.earlier(keyframe) for keyframe in keyframes]
+        now, past = ([keyframe.world_from_ego for keyframe in each] for each in (keyframes, earlier))
+        past_from_now = torch.from_numpy(np.linalg.inv(past) @ np.stack(now)).float()
+        age_s = torch.tensor([(b.timestamp_us - a.timestamp_us) / 1e6 for a, b in zip(earlier, keyframes, strict=True)])
+        return {"history": [PastFrame(past_from_now, age_s, *material.online(earlier))]}
 
     def scorer(self, model: OccupancyModel) -> Scorer:
         return VoxelScorer(self, model)

@@ -90,7 +90,8 @@ class _Training:
         if self._memory is not None and images is not None and rig is not None:
             return self._memory.predict(images, rig, keyframes, remember=True)
         prior = collate([self._prior[row] for row in rows]) if self._prior is not None else None
-        return self._model(images, rig, prior)
+        more = self._task.more_inputs(keyframes, self._material) if images is not None else {}
+        return self._model(images, rig, prior, **more)
 
     def _resume(self) -> int:
         """The step to go on with."""

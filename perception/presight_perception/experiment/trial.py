@@ -67,7 +67,8 @@ class Trial:
         images, rig = self._material.online(keyframes) if online else (None, None)
         if self._memory is not None and images is not None and rig is not None:
             return self._memory.predict(images, rig, keyframes, remember=False)
-        return self._model(images, rig, None if self._prior is None else self.prior(rows))
+        more = self._task.more_inputs(keyframes, self._material) if images is not None else {}
+        return self._model(images, rig, None if self._prior is None else self.prior(rows), **more)
 
 
 def constant_mask_figures(task: MapTask, material: Material) -> dict[str, Figures]:
