@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from presight_core.errors import InputError
+from presight_core.frames import planar_transform
 from presight_perception.dataset import PositionNoise
 from presight_perception.experiment.keyframes import ImageSize, lidar_depth, read_images, read_keyframes, rig_of
 from presight_perception.experiment.material import Locations, Material
@@ -211,6 +212,12 @@ def test_the_best_constant_mask_is_what_all_truths_share(material: Material) -> 
     assert 20 < figures["all"]["mean"] < 100  # the drives pass the same crossroads, a little apart
     assert figures["night"] == figures["all"]  # the one test drive is at night
     assert "day" not in figures
+
+
+def test_ground_is_mapped_where_the_prior_has_something_under_the_vehicle(material: Material) -> None:
+    here, there = material.test[0], replace(material.test[0], world_from_ego=planar_transform(500.0, 0.0, 0.0))
+    assert (material.is_mapped(here), material.is_mapped(there)) == (True, False)
+    assert material.groups_of(here.token) == ("all", "night", "mapped ground")
 
 
 def test_a_run_is_kept_and_named_by_all_that_decides_it(material: Material, tmp_path: Path) -> None:

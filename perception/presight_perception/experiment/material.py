@@ -20,6 +20,8 @@ from presight_perception.voxelise import VoxelGrid
 
 WITHOUT_VOXELS: tuple[PriorKind, ...] = ("none", "nmp")
 GEOMETRY_CHANNELS = 4  # of a voxel: its place and its hits
+AT_THE_VEHICLE_M = -5.0, 5.0
+HEIGHTS_M = -3.0, 5.0
 CACHE_BYTES = 1 << 30  # of prior windows a process: those of a thousand tiny samples
 
 
@@ -42,6 +44,7 @@ class Material:
         self.locations = locations
         self.keyframes = read_keyframes(locations.data, locations.version)
         self.image = cache(self._image)
+        self.groups_of = cache(self._groups_of)
 
     @cached_property
     def train(self) -> list[Keyframe]:
@@ -116,6 +119,11 @@ class Material:
         settings = PriorSettings(grid, run.prior != "geometry", drop=run.drop, cache_bytes=CACHE_BYTES, seed=run.seed)
         return PriorDataset(self._source(run), [self._place(run, each, own=False) for each in self.train], settings)
 
+    def is_mapped(self, keyframe: Keyframe) -> bool:
+        """Whether the prior has anything where the vehicle stands."""
+        place = Place(keyframe.city, keyframe.world_from_ego)
+        return len(self.priors.points(place, (AT_THE_VEHICLE_M, AT_THE_VEHICLE_M, HEIGHTS_M)).points_ego) > 0
+
     def prior_drives(self, probe: Probe) -> list[Keyframe]:
         """The keyframes that the test cities' priors were made from, as far as a probe shows them."""
         cities = {keyframe.city for keyframe in self.test}
@@ -161,6 +169,15 @@ class Material:
                 "presight synth OUT --preset experiment"
             )
         return chosen
+
+    def _groups_of(self, token: str) -> tuple[str, ...]:
+        """What a test keyframe's figures count for: all, day or night, and whether the prior saw this ground."""
+        keyframe = self.keyframes[self._row_of[token]]
+        return (
+            "all",
+            "night" if keyframe.is_night else "day",
+            "mapped ground" if self.is_mapped(keyframe) else "new ground",
+        )
 
     def _image(self, token: str) -> Tensor:
         return read_images(self.keyframes[self._row_of[token]], self.locations.image_size)

@@ -11,6 +11,7 @@ import numpy as np
 from presight_perception.experiment.runner import Outcome
 
 LEAST_SPREAD = 2  # seeds; of a single one there is no spread to show
+GROUPS = ("day", "night", "mapped ground", "new ground")
 MAP_FIGURES = ("mean", "ped_crossing", "divider", "boundary")
 OCCUPANCY_FIGURES = ("mean", "static", "dynamic")
 
@@ -43,7 +44,7 @@ def table_of(outcomes: Sequence[Outcome]) -> tuple[list[str], list[list[str]]]:
     """Column names and a line for each label: the mean over its seeds, and their spread (standard deviation)."""
     is_map = "static" not in outcomes[0].figures["all"]
     names = MAP_FIGURES if is_map else OCCUPANCY_FIGURES
-    groups = ["all", *(group for group in ("day", "night") if group in outcomes[0].figures)]
+    groups = ["all", *(group for group in GROUPS if group in outcomes[0].figures)]
     cells = [("all", name) for name in names] + [(group, "mean") for group in groups[1:]]
     by_label: dict[str, list[Outcome]] = {}
     for outcome in outcomes:

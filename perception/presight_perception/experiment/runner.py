@@ -23,7 +23,8 @@ from presight_perception.experiment.tasks import Figures, MapTask, task_of
 from presight_perception.experiment.training import trained_model
 from presight_perception.experiment.trial import Trial, constant_mask_figures
 
-CODE = 1  # raise it when the same run would give other figures
+CODE = 1  # raise it when the same run would give another model
+FIGURES = 2  # raise it when the same model would be given other figures
 
 _material: dict[str, Material] = {}  # of this process, which reads the tables once
 
@@ -40,7 +41,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The figures of one row: all, by day and by night, percent."""
+    """The figures of one row, by group of keyframes, percent."""
 
     row: Row
     figures: dict[str, Figures]
@@ -79,7 +80,7 @@ def do_job(job: Job) -> list[dict[str, Figures]]:
     model = trained_model(job.run, task, material, folder, follow.tell)
     found = []
     for probe in job.probes:
-        file = folder / f"figures-{digest(probe, job.locations.test_stride)}.json"
+        file = folder / f"figures-{digest(FIGURES, probe, job.locations.test_stride)}.json"
         if not file.exists():
             figures = Trial(model, job.run, probe, task, material).figures(follow.tell)
             _write_json(file, {"probe": asdict(probe), "figures": figures})

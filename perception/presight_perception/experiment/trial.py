@@ -37,13 +37,13 @@ class Trial:
             self._memory.drive(material.prior_drives(probe), material)
 
     def figures(self, report: Report = silent) -> dict[str, Figures]:
-        """Figures over all test keyframes, and over those by night and by day."""
+        """Figures over all test keyframes, and over groups of them, see `Material.groups_of`."""
         count = len(self._material.test)
         scorers: dict[str, Scorer] = defaultdict(lambda: self._task.scorer(self._model))
         for first in range(0, count, BATCH):
             rows = range(first, min(first + BATCH, count))
             for row, found in zip(rows, self.found(rows), strict=True):
-                _add(scorers, found, self._material.test[row])
+                _add(scorers, found, self._material.test[row], self._material)
             report(Progress(f"{self._run.title}, tried", rows[-1] + 1, count))
         return {name: scorer.result() for name, scorer in scorers.items()}
 
@@ -79,13 +79,13 @@ def constant_mask_figures(task: MapTask, material: Material) -> dict[str, Figure
     masks = np.stack([_best_cut(trained[:, each]) for each in range(trained.shape[1])])
     scorers: dict[str, Scorer] = defaultdict(lambda: MaskScorer(task, settings))
     for keyframe in material.test:
-        _add(scorers, masks, keyframe)
+        _add(scorers, masks, keyframe, material)
     return {name: scorer.result() for name, scorer in scorers.items()}
 
 
-def _add(scorers: dict[str, Scorer], found: Any, keyframe: Keyframe) -> None:
-    for name in ("all", "night" if keyframe.is_night else "day"):
-        scorers[name].add(found, keyframe)
+def _add(scorers: dict[str, Scorer], found: Any, keyframe: Keyframe, material: Material) -> None:
+    for group in material.groups_of(keyframe.token):
+        scorers[group].add(found, keyframe)
 
 
 def _best_cut(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
