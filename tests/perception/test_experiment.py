@@ -11,7 +11,7 @@ import torch
 
 from presight_core.errors import InputError
 from presight_core.frames import planar_transform
-from presight_perception.dataset import PositionNoise
+from presight_perception.dataset import PositionNoise, PriorDataset
 from presight_perception.experiment.keyframes import ImageSize, lidar_depth, read_images, read_keyframes, rig_of
 from presight_perception.experiment.material import Locations, Material
 from presight_perception.experiment.report import table_of, write_report
@@ -19,7 +19,7 @@ from presight_perception.experiment.runner import Job, Outcome, do_job, do_rows,
 from presight_perception.experiment.runs import Probe, Run, Schedule
 from presight_perception.experiment.tables import TABLES, Row, Scope, rows_of
 from presight_perception.experiment.tasks import MapTask, task_of
-from presight_perception.experiment.training import batch_rows, begins_epoch, trained_model
+from presight_perception.experiment.training import batch_rows, epoch_of, trained_model
 from presight_perception.experiment.trial import Trial, constant_mask_figures
 from tests.perception import toy_dataset
 from tests.perception.conftest import publish
@@ -202,7 +202,16 @@ def test_a_model_with_a_map_of_its_own_remembers_the_prior_drives(material: Mate
 
 def test_an_epoch_begins_where_all_samples_were_seen() -> None:
     schedule = Schedule(batch_size=3)
-    assert [begins_epoch(schedule, 7, step) for step in range(6)] == [False, False, False, True, False, True]
+    assert [epoch_of(schedule, 7, step) for step in range(-1, 6)] == [0, 0, 0, 0, 1, 1, 2]
+
+
+def test_every_epoch_of_a_training_hides_something_else_of_the_prior(
+    material: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    epochs: list[int] = []
+    monkeypatch.setattr(PriorDataset, "set_epoch", lambda self, epoch: epochs.append(epoch))
+    trained_model(WITH_PRIOR, task_of("raster", material.locations), material, tmp_path, lambda _: None)
+    assert epochs == [0, 0, 1]  # three steps of two samples, of four
 
 
 def test_the_best_constant_mask_is_what_all_truths_share(material: Material) -> None:

@@ -23,7 +23,7 @@ from presight_perception.experiment.tasks import Figures, MapTask, task_of
 from presight_perception.experiment.training import trained_model
 from presight_perception.experiment.trial import Trial, constant_mask_figures
 
-CODE = 1  # raise it when the same run would give another model
+CODE = 2  # raise it when the same run would give another model
 FIGURES = 2  # raise it when the same model would be given other figures
 
 _material: dict[str, Material] = {}  # of this process, which reads the tables once

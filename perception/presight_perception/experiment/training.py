@@ -63,7 +63,10 @@ class _Training:
         losses: list[float] = []
         self._model.train()
         for step in range(self._resume(), self._run.schedule.steps):
-            if self._memory is not None and begins_epoch(self._run.schedule, len(self._material.train), step):
+            epoch = epoch_of(self._run.schedule, len(self._material.train), step)
+            if self._prior is not None:
+                self._prior.set_epoch(epoch)  # or every epoch would hide the same
+            if self._memory is not None and epoch > epoch_of(self._run.schedule, len(self._material.train), step - 1):
                 self._memory.clear()
             losses.append(self._step(batch_rows(self._run.schedule, self._run.seed, len(self._material.train), step)))
             done = step + 1
@@ -125,10 +128,9 @@ def batch_rows(schedule: Schedule, seed: int, count: int, step: int) -> list[int
     return rows
 
 
-def begins_epoch(schedule: Schedule, count: int, step: int) -> bool:
-    """Whether the step before this one ended an epoch."""
-    places = step * schedule.batch_size
-    return places // count > max(places - schedule.batch_size, 0) // count
+def epoch_of(schedule: Schedule, count: int, step: int) -> int:
+    """The epoch that a step begins in, of `count` samples."""
+    return max(step, 0) * schedule.batch_size // count
 
 
 def _write_whole(file: Path, write: Any) -> None:
