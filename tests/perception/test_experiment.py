@@ -1,6 +1,8 @@
 """Experiments: what is trained, what is shown when a model is tried, and that work is done once."""
 
 import json
+import os
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,7 @@ from presight_perception.dataset import PositionNoise, PriorDataset
 from presight_perception.experiment.keyframes import ImageSize, lidar_depth, read_images, read_keyframes, rig_of
 from presight_perception.experiment.material import Locations, Material
 from presight_perception.experiment.report import table_of, write_report
-from presight_perception.experiment.runner import Job, Outcome, do_job, do_rows, run_folder
+from presight_perception.experiment.runner import Job, Outcome, do_job, do_rows, run_folder, running
 from presight_perception.experiment.runs import Probe, Run, Schedule
 from presight_perception.experiment.tables import TABLES, Row, Scope, rows_of
 from presight_perception.experiment.tasks import MapTask, task_of
@@ -244,6 +246,15 @@ def test_a_job_that_is_done_is_not_done_again(locations: Locations, tmp_path: Pa
     assert do_job(job) == first
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.*")} == before
     assert {file.suffix for file in before} == {".safetensors", ".json"}  # no checkpoint, no word of progress is left
+
+
+def test_runs_at_work_are_those_that_said_something_lately(tmp_path: Path) -> None:
+    for name, ago_s in (("at-work", 1.0), ("killed", 3600.0)):
+        file = tmp_path / name / "progress.json"
+        file.parent.mkdir()
+        file.write_text(json.dumps({"stage": name, "done": 1, "total": 2, "figures": {}}))
+        os.utime(file, (time.time() - ago_s, time.time() - ago_s))
+    assert [each.stage for each in running(tmp_path)] == ["at-work"]
 
 
 def test_a_job_ends_when_nobody_waits_for_it(

@@ -7,6 +7,7 @@ and a broken-off experiment goes on where it was.
 import json
 import multiprocessing
 import sys
+import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -24,6 +25,7 @@ from presight_perception.experiment.training import trained_model
 from presight_perception.experiment.trial import Trial, constant_mask_figures
 
 CODE = 2  # raise it when the same run would give another model
+SILENT_S = 300.0  # who has said nothing for so long was killed
 FIGURES = 2  # raise it when the same model would be given other figures
 
 _material: dict[str, Material] = {}  # of this process, which reads the tables once
@@ -127,6 +129,8 @@ def running(folder: Path) -> list[Progress]:
     found = []
     for file in sorted(folder.glob("*/progress.json")):
         try:
+            if time.time() - file.stat().st_mtime > SILENT_S:
+                continue
             found.append(Progress(**json.loads(file.read_text(encoding="utf-8"))))
         except (OSError, ValueError):  # it has just ended, or been replaced
             continue
