@@ -1,10 +1,12 @@
 """Train one model, going on where an interrupted training stopped."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -37,9 +39,9 @@ def trained_model(run: Run, task: Task, material: Material, folder: Path, report
     model, weights = build_model(run, material), folder / "weights.safetensors"
     if not weights.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        _Training(run, task, material, model, folder / "checkpoint.pt").go(report)
+        _Training(run, task, material, model, folder / "checkpoint.safetensors").go(report)
         _write_whole(weights, lambda file: save_file(model.state_dict(), file))
-        (folder / "checkpoint.pt").unlink(missing_ok=True)
+        (folder / "checkpoint.safetensors").unlink(missing_ok=True)
     model.load_state_dict(load_file(weights))
     return model.eval()
 
@@ -100,22 +102,32 @@ class _Training:
         """The step to go on with."""
         if not self._checkpoint.exists():
             return 0
-        state: dict[str, Any] = torch.load(self._checkpoint, weights_only=True)
-        self._model.load_state_dict(state["model"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._rate.load_state_dict(state["rate"])
-        torch.set_rng_state(state["random"])
-        return state["step"]
+        with safe_open(self._checkpoint, "pt") as kept:
+            facts = json.loads(kept.metadata()["facts"])
+            tensors = {name: kept.get_tensor(name) for name in kept.keys()}  # noqa: SIM118 - no mapping
+        self._model.load_state_dict(_below("model.", tensors))
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, value in _below("optimizer.", tensors).items():
+            row, _, field = name.partition(".")
+            state.setdefault(int(row), {})[field] = value
+        self._optimizer.load_state_dict({"state": state, "param_groups": facts["groups"]})
+        self._rate.load_state_dict(facts["rate"])
+        torch.set_rng_state(tensors["random"])
+        return facts["step"]
 
     def _keep(self, step: int) -> None:
-        state = {
-            "model": self._model.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "rate": self._rate.state_dict(),
-            "random": torch.get_rng_state(),
-            "step": step,
-        }
-        _write_whole(self._checkpoint, lambda file: torch.save(state, file))
+        optimizer = self._optimizer.state_dict()
+        tensors = {f"model.{name}": value for name, value in self._model.state_dict().items()}
+        for row, values in optimizer["state"].items():
+            tensors |= {f"optimizer.{row}.{name}": value for name, value in values.items()}
+        tensors["random"] = torch.get_rng_state()
+        facts = {"step": step, "groups": optimizer["param_groups"], "rate": self._rate.state_dict()}
+        contiguous = {name: value.contiguous() for name, value in tensors.items()}
+        _write_whole(self._checkpoint, lambda file: save_file(contiguous, file, {"facts": json.dumps(facts)}))
+
+
+def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def batch_rows(schedule: Schedule, seed: int, count: int, step: int) -> list[int]:
