@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from presight_core import frames
 from presight_core.errors import InputError
-from presight_perception.nuscenes_tables import NuscenesTables
+from presight_perception.nuscenes_tables import FileRow, NuscenesTables, SceneRow
 
 CHANNEL = "LIDAR_TOP"
 POINT_VALUES = 5  # float32 each: x, y, z in metres, intensity, ring
@@ -57,10 +57,13 @@ def read_sweeps(root: Path, version: str, drives: Collection[str]) -> list[Sweep
             f"{tables.folder}: no {CHANNEL} keyframes of {', '.join(missing)}; choose drives that have them"
         )
     poses = tables.poses(files.values())
-    sweeps = []
-    for token, row in files.items():
-        scene = tables.scene_of(token)
-        ego_from_lidar = tables.calibrations[row.calibrated_sensor_token].transform
-        world_from_ego = poses[row.ego_pose_token].transform
-        sweeps.append(Sweep(scene.name, tables.city_of(scene), root / row.filename, ego_from_lidar, world_from_ego))
-    return sweeps
+    return [
+        sweep_of(tables, tables.scene_of(token), row, poses[row.ego_pose_token].transform)
+        for token, row in files.items()
+    ]
+
+
+def sweep_of(tables: NuscenesTables, scene: SceneRow, row: FileRow, world_from_ego: NDArray[np.float64]) -> Sweep:
+    """The sweep in a file of the lidar; `world_from_ego` (4, 4) at its time."""
+    ego_from_lidar = tables.calibrations[row.calibrated_sensor_token].transform
+    return Sweep(scene.name, tables.city_of(scene), tables.root / row.filename, ego_from_lidar, world_from_ego)

@@ -13,9 +13,9 @@ from torch import Tensor
 from presight_core import frames
 from presight_core.errors import InputError
 from presight_core.nuscenes_split import Role, role_of
-from presight_perception.lidar_sweeps import CHANNEL, Sweep
+from presight_perception.lidar_sweeps import CHANNEL, Sweep, sweep_of
 from presight_perception.models.camera_rig import LEAST_DEPTH_M, CameraRig
-from presight_perception.nuscenes_tables import FileRow, NuscenesTables, PoseRow, Rows, SceneRow
+from presight_perception.nuscenes_tables import FileRow, NuscenesTables, PoseRow, Rows
 
 # nuScenes' six, clockwise from the front left.
 CAMERAS = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT")
@@ -116,11 +116,6 @@ def lidar_depth(keyframe: Keyframe, size: ImageSize) -> Tensor | None:
     return torch.from_numpy(np.where(np.isinf(depth), 0, depth))
 
 
-def _sweep(tables: NuscenesTables, scene: SceneRow, row: FileRow, world_from_ego: NDArray[np.float64]) -> Sweep:
-    ego_from_lidar = tables.calibrations[row.calibrated_sensor_token].transform
-    return Sweep(scene.name, tables.city_of(scene), tables.root / row.filename, ego_from_lidar, world_from_ego)
-
-
 def _keyframe(tables: NuscenesTables, poses: Rows[PoseRow], token: str, channels: dict[str, FileRow]) -> Keyframe:
     """One sample, joined."""
     scene = tables.scene_of(token)
@@ -142,5 +137,5 @@ def _keyframe(tables: NuscenesTables, poses: Rows[PoseRow], token: str, channels
         ego_from_camera=np.stack(
             [ego_from_world @ world_from_ego_then[camera] @ row.transform for camera, row in mounted.items()]
         ),
-        sweep=_sweep(tables, scene, channels[CLOCK], world_from_ego) if CLOCK in channels else None,
+        sweep=sweep_of(tables, scene, channels[CLOCK], world_from_ego) if CLOCK in channels else None,
     )

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from presight_core.errors import InputError, NotFoundError
 from presight_core.nuscenes_split import Role
+from presight_core.priors import PriorReader
 from presight_perception.dataset import CityPriors, Place, PriorDataset, PriorSettings, PriorSource
 from presight_perception.experiment.keyframes import ImageSize, Keyframe, read_images, read_keyframes, rig_of
 from presight_perception.experiment.runs import PriorKind, Probe, Run, digest
@@ -68,7 +69,7 @@ class Material:
         generations = {}
         for city in sorted({keyframe.city for keyframe in self.keyframes}):
             try:
-                generations |= CityPriors(self.locations.store, {city: None}).generations
+                generations[city] = PriorReader.open(self.locations.store, city).generation.number
             except NotFoundError:
                 continue
         missing = {keyframe.city for keyframe in self.test} - generations.keys()

@@ -14,7 +14,7 @@ from presight_perception.experiment.keyframes import CAMERAS, Keyframe
 from presight_perception.experiment.tasks import MapTask, OccupancyTask, Task
 from presight_perception.map_truth import MAP_CLASSES, RasterSettings, rasterise
 from presight_perception.metrics import ScoredLines
-from presight_perception.occupancy_truth import OCCUPANCY_CLASSES, OccupancyTruth
+from presight_perception.occupancy_truth import FREE, OccupancyTruth
 from presight_perception.voxelise import VoxelGrid
 
 Picture = NDArray[np.uint8]  # (H, W, 3) BGR
@@ -23,7 +23,6 @@ HEIGHT_PX = 240  # of every picture
 CLASS_COLOURS = ((230, 150, 40), (40, 190, 230), (60, 60, 220))  # BGR of crossings, dividers, boundaries
 LEAST_SCORE = 0.4  # of a line that is shown
 BACKGROUND = 245
-FREE = OCCUPANCY_CLASSES.index("free")
 CAPTION_PX = 20
 
 

@@ -21,7 +21,7 @@ from presight_perception.experiment.material import Locations, Material
 from presight_perception.experiment.runs import Probe, Run, digest
 from presight_perception.experiment.tables import Row
 from presight_perception.experiment.tasks import Figures, MapTask, task_of
-from presight_perception.experiment.training import trained_model
+from presight_perception.experiment.training import trained_model, write_whole
 from presight_perception.experiment.trial import Trial, constant_mask_figures
 
 CODE = 2  # raise it when the same run would give another model
@@ -138,6 +138,4 @@ def running(folder: Path) -> list[Progress]:
 
 
 def _write_json(file: Path, value: Any) -> None:
-    part = file.with_suffix(".part")
-    part.write_text(json.dumps(value, indent=1), encoding="utf-8")
-    part.replace(file)
+    write_whole(file, lambda part: part.write_text(json.dumps(value, indent=1), encoding="utf-8"))

@@ -1,6 +1,7 @@
 """Train one model, going on where an interrupted training stopped."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def trained_model(run: Run, task: Task, material: Material, folder: Path, report
     if not weights.exists():
         folder.mkdir(parents=True, exist_ok=True)
         _Training(run, task, material, model, folder / "checkpoint.safetensors").go(report)
-        _write_whole(weights, lambda file: save_file(model.state_dict(), file))
+        write_whole(weights, lambda file: save_file(model.state_dict(), file))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)
     model.load_state_dict(load_file(weights))
     return model.eval()
@@ -123,7 +124,7 @@ class _Training:
         tensors["random"] = torch.get_rng_state()
         facts = {"step": step, "groups": optimizer["param_groups"], "rate": self._rate.state_dict()}
         contiguous = {name: value.contiguous() for name, value in tensors.items()}
-        _write_whole(self._checkpoint, lambda file: save_file(contiguous, file, {"facts": json.dumps(facts)}))
+        write_whole(self._checkpoint, lambda file: save_file(contiguous, file, {"facts": json.dumps(facts)}))
 
 
 def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -145,7 +146,7 @@ def epoch_of(schedule: Schedule, count: int, step: int) -> int:
     return max(step, 0) * schedule.batch_size // count
 
 
-def _write_whole(file: Path, write: Any) -> None:
+def write_whole(file: Path, write: Callable[[Path], object]) -> None:
     """Write a file such that it is there whole or not at all."""
     part = file.with_suffix(".part")
     write(part)
