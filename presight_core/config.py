@@ -75,7 +75,7 @@ class FieldSettings(Settings):
     hidden_width: Count = 64
     proposal_width: Count = 64  # hidden units of the proposal networks (paper: 64 everywhere)
     geometry_channels: Count = 15
-    video_embedding: Count = 12
+    video_embedding: Annotated[int, Field(ge=0)] = 12
     image_embedding: Annotated[int, Field(ge=0)] = 4
     density_bias: float = -4.0  # metres; the released code, whose poses are scaled by 0.05, needs none
 
