@@ -24,11 +24,11 @@ from presight_core.field import threads
 from presight_core.frames import planar_transform
 from stages.ray_pool import PixelBatch
 from stages.tiling import sub_fields
-from stages.training import Run, TileTraining
+from stages.training import Run, TileTraining, training_rows
 
 STREET_M = 200.0
 FRAMES = 64
-CHANNELS = 32
+CHANNELS = 64  # paper
 WARM_UP = 3  # steps: kernels load and memory grows
 
 
@@ -176,7 +176,7 @@ def random_batch(job: TileTraining, seed: int) -> PixelBatch:
     """Rays of random frames in all directions near the horizon, with random targets."""
     random = np.random.default_rng(seed)
     count = job.settings.training.batch_rays
-    rows = random.integers(len(job.frames), size=count)
+    rows = random.choice(training_rows(job.frames, job.settings.training), count)
     directions = random.normal(size=(count, 3)) * (1, 1, 0.2)
     return PixelBatch(
         rows,
