@@ -1,16 +1,13 @@
 import collections
-import json
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-pytest.importorskip("triton")
+from tests.core.without_card import compile_for_hopper, interpreted
 
-ROOT = Path(__file__).parents[2]
+pytest.importorskip("triton")
+pytestmark = pytest.mark.slow
+
 TOLERANCES = {
     "values, 4 features": 1e-6,
     "values, 1 features": 1e-6,
@@ -30,11 +27,7 @@ TOLERANCES = {
 
 @pytest.fixture(scope="module")
 def errors() -> dict[str, float]:
-    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "tests.core.triton_interpreted"]
-    run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    return json.loads(run.stdout)
+    return interpreted("hash")
 
 
 @pytest.mark.parametrize("case", TOLERANCES)
@@ -66,19 +59,6 @@ def _accesses(kernel, features: int) -> collections.Counter[str]:
     constants = {"sub_field_count": 16, "level_count": 8, "features": features, "row": features}
     compiled = compile_for_hopper(kernel, types, constants | {"block": 256, "level_block": 2})
     return collections.Counter(re.findall(r"\b(?:red|atom|ld|st)\.[\w.]+", compiled.asm["ptx"]))
-
-
-def compile_for_hopper(kernel, types: dict[str, str], constants: dict[str, int]):
-    """A kernel compiled for sm_90, every pointer at a multiple of 16 bytes as torch's allocator gives them."""
-    from triton.backends.compiler import GPUTarget
-    from triton.compiler import ASTSource, compile
-
-    names = kernel.arg_names
-    signature = {name: "constexpr" if name in constants else types[name] for name in names}
-    aligned = {(i,): [["tt.divisibility", 16]] for i, name in enumerate(names) if signature[name].startswith("*")}
-    values = {(names.index(name),): value for name, value in constants.items()}
-    source = ASTSource(fn=kernel, signature=signature, constexprs=values, attrs=aligned)
-    return compile(source, target=GPUTarget("cuda", 90, 32), options={"num_warps": 4, "enable_fp_fusion": True})
 
 
 def test_rows_of_four_are_read_by_one_access(accesses):

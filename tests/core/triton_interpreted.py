@@ -1,16 +1,19 @@
 """Kernels under Triton's interpreter, in a process of their own: the interpreter is chosen before the first import.
 
-`TRITON_INTERPRET=1 python -m tests.core.triton_interpreted` prints the largest error of every case as JSON.
+`TRITON_INTERPRET=1 python -m tests.core.triton_interpreted PART` prints the error of every case as JSON.
 """
 
 import json
+import sys
 
 import torch
 from torch import Tensor
 
 from presight_core.config import GridSettings
+from presight_core.field.assignment import Assignment
 from presight_core.field.hash_encode import grid_layout, hash_encode, torch_reference
 from presight_core.field.hash_encode.triton_kernels import Launch, encode
+from presight_core.field.mlp import SubFieldMlp
 
 POINTS = 90  # the second block of 64 is not full
 
@@ -65,12 +68,38 @@ def _arguments(level_count: int, features: int) -> tuple[Tensor, ...]:
 
 
 def _error(found: Tensor, expected: Tensor) -> float:
-    """The largest difference, as a share of the largest value."""
+    """The length of the difference, as a share of the expected length."""
     assert found.shape == expected.shape
     assert found.dtype == expected.dtype
-    return float((found - expected).abs().max() / expected.abs().max())
+    return float((found.float() - expected.float()).norm() / expected.float().norm())
 
+
+def mlp_cases() -> dict[str, float]:
+    """Errors of the sub-fields' networks and their gradients against a loop of linear layers."""
+    errors = {}
+    for widths, dtype in (
+        ((8, 20, 1), torch.float32),
+        ((40, 64, 80), torch.float16),
+        ((47, 16, 16, 3), torch.float32),
+        ((47, 16, 16, 3), torch.float16),
+    ):
+        network = SubFieldMlp(3, widths)
+        network.dtype = dtype
+        assignment = Assignment(torch.tensor([0, 70, 70, 1200]))  # the last one needs two programs on the way back
+        inputs = torch.randn(1200, widths[0], requires_grad=True)
+        output = network(inputs, assignment)
+        plain = network._one_by_one(inputs, assignment.bounds)
+        upstream = torch.randn_like(output)
+        wanted = (inputs, *network.parameters())
+        found, expected = (torch.autograd.grad(values, wanted, upstream) for values in (output, plain))
+        name = f"{widths} {str(dtype).removeprefix('torch.')}"
+        errors[f"{name} values"] = _error(output, plain)
+        errors[f"{name} gradients"] = max(_error(*pair) for pair in zip(found, expected, strict=True))
+    return errors
+
+
+PARTS = {"hash": hash_cases, "mlp": mlp_cases}
 
 if __name__ == "__main__":
     torch.manual_seed(0)
-    print(json.dumps(hash_cases()))
+    print(json.dumps(PARTS[sys.argv[1]]()))
