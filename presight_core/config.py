@@ -163,6 +163,7 @@ class WorkspaceSettings(Settings):
     catalog: str | None = None  # SQLAlchemy URL
     store: str | None = None  # folder or object-store URL of the prior store
     caches: str | None = None  # folder for frames, features and training scratch
+    lease_s: Annotated[float, Field(ge=1)] = 60.0  # a build that is silent for so long is taken for dead
 
 
 SettingsType = TypeVar("SettingsType", bound=Settings)
