@@ -1,9 +1,11 @@
+import math
+
 import pytest
 import torch
 
 from presight_core.config import TrainingSettings
 from presight_core.field import losses, rendering, samplers, schedule
-from presight_core.field.assignment import assign
+from presight_core.field.assignment import Assignment, assign
 from presight_core.field.contraction import contract, grid_position
 from presight_core.field.mlp import SubFieldMlp
 from presight_core.field.spherical_harmonics import spherical_harmonics
@@ -114,6 +116,13 @@ def random_histogram(bins: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return edges, weights / weights.sum(-1, keepdim=True)
 
 
+def test_the_ground_loss_is_the_missing_weight_beyond_the_start_of_the_ground():
+    weights = torch.tensor([[0.25, 0.5, 0.0], [0.0, 0.0, 0.0]])
+    middles_m = torch.tensor([[1.0, 2.0, 3.0]]).expand(2, 3)
+    loss = losses.ground_loss(weights, middles_m, torch.tensor([1.5, 0.0]))
+    assert loss.item() == pytest.approx(-math.log(0.5) / 2)  # the second ray knows of no ground
+
+
 def test_distortion_equals_the_sum_over_all_pairs():
     edges, weights = random_histogram(9, 0)
     middles = (edges[:, 1:] + edges[:, :-1]) / 2
@@ -183,7 +192,7 @@ def test_restoring_passes_gradients_to_the_right_rows():
 def test_each_sub_field_has_its_own_network():
     network = SubFieldMlp(2, (3, 4, 2))
     inputs = torch.ones(5, 3)
-    outputs = network(inputs, [0, 2, 5])
+    outputs = network(inputs, Assignment(torch.tensor([0, 2, 5])))
     assert torch.equal(outputs[0], outputs[1])
     assert torch.equal(outputs[2], outputs[4])
     assert not torch.equal(outputs[0], outputs[2])
