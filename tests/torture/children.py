@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from presight_core import failpoints
-from presight_core.errors import PresightError
+from presight_core.errors import PresightError, StoreError
 
 KILLED = -signal.SIGKILL
 PATIENCE_S = 120  # a child that takes longer hangs, on however busy a machine
@@ -84,6 +84,9 @@ def start(work: Callable[[Acknowledge], Any], log: Path, setting: str = "") -> C
     except PresightError as error:
         os.write(2, f"{type(error).__name__}: {error}\n".encode())
         code = error.exit_code
+    except OSError as error:  # as the command does
+        os.write(2, traceback.format_exc().encode())
+        code = StoreError.exit_code if error.errno else 99
     except BaseException:
         os.write(2, traceback.format_exc().encode())
     os._exit(code)
@@ -110,4 +113,4 @@ def end_all() -> None:
 
 
 def _say(pipe: int, value: Any) -> None:
-    os.write(pipe, (json.dumps(value) + "\n").encode())
+    os.writev(pipe, [(json.dumps(value) + "\n").encode()])  # not `write`, which a test may let fail

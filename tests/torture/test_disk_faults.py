@@ -73,7 +73,7 @@ def held(work, pipe: int):
 
 
 @pytest.mark.parametrize("calls", CALLS)
-def test_a_failing_system_call_is_a_typed_error_and_changes_nothing_that_is_shown(calls, city, prepared, truth, is_long):
+def test_a_failing_system_call_is_a_typed_error_and_what_is_shown_stays(calls, city, prepared, truth, is_long):
     if not strace_works():
         pytest.skip("strace cannot trace here: install it, or allow ptrace")
     meetings = range(1, 200) if is_long else (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
@@ -103,7 +103,7 @@ def disk(tmp_path):
     subprocess.run(["umount", str(folder)], check=True)
 
 
-def test_a_full_disk_is_a_typed_error_and_changes_nothing_that_is_shown(disk, prepared, truth, is_long):
+def test_a_full_disk_is_a_typed_error_and_what_is_shown_stays(disk, prepared, truth, is_long):
     whole = copy_of(prepared, disk / "whole")
     children.result(whole_run(whole), disk / "log")
     need = sum(file.stat().st_size for file in whole.root.rglob("*") if file.is_file())

@@ -1,5 +1,6 @@
 """Row R7 of docs/reliability.md: writers, readers and a run that was taken for dead, all in processes of their own."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from storage.priors import PriorStore
 from storage.tile_groups import TileName
 from tests.torture import children
 from tests.torture.conftest import whole_run
-from tests.torture.toy_city import CITY, ToyCity
+from tests.torture.toy_city import CITY
 
 pytestmark = pytest.mark.slow
 
@@ -80,7 +81,7 @@ def in_parallel(location: str, commits: int, log: Path) -> None:
     assert acknowledged == list(range(2, total + 1)), "every acknowledged commit has a generation of its own"
     told = children.result(lambda: history(location), log)
     assert [(number, parent) for number, parent, _ in told] == [(n, n - 1 or None) for n in range(1, total + 1)]
-    for (_, _, before), (_, _, after) in zip(told, told[1:], strict=False):
+    for (_, _, before), (_, _, after) in pairwise(told):
         assert sum(after.values()) + len(after) == sum(before.values()) + len(before) + 1, "one commit, one change"
     assert told[-1][2] == {f"t{number:03}": each - 1 for number in range(WRITERS)}
 

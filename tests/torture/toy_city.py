@@ -101,7 +101,7 @@ class ToyCity:
         assert drives == sorted(index.drives(), key=lambda drive: (drive.start_us, drive.drive_id))
         assert all(len(index.frames(drive.drive_id)) == drive.frame_count for drive in drives)
         assert catalog.running(CITY) == []
-        shown = {tile_id for tile_id in self.check()}
+        shown = set(self.check())
         assert {build.tile_id for build in catalog.builds(CITY, "published")} == shown
 
     def _written(self, workspace: Workspace, job) -> Built:
