@@ -73,23 +73,34 @@ def start(work: Callable[[Acknowledge], Any], log: Path, setting: str = "") -> C
         os.close(writing)
         _running.add(process)
         return Child(process, reading, log)
-    code = 99
     try:
         os.close(reading)
         os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), 2)
         sys.stdout = sys.stderr = io.StringIO()  # a terminal's faults are not what is tested
         failpoints.arm(setting)
-        work(lambda value: _say(writing, value))
-        code = 0
+        os._exit(_exit_code(lambda: work(lambda value: _say(writing, value))))
+    finally:
+        os._exit(98)  # whatever happens, the child never becomes a second test run
+
+
+def _exit_code(work: Callable[[], Any]) -> int:
+    """What the command would end with."""
+    try:
+        work()
     except PresightError as error:
-        os.write(2, f"{type(error).__name__}: {error}\n".encode())
-        code = error.exit_code
+        _log(f"{type(error).__name__}: {error}\n")
+        return error.exit_code
     except OSError as error:  # as the command does
-        os.write(2, traceback.format_exc().encode())
-        code = StoreError.exit_code if error.errno else 99
+        _log(traceback.format_exc())
+        return StoreError.exit_code if error.errno else 99
     except BaseException:
-        os.write(2, traceback.format_exc().encode())
-    os._exit(code)
+        _log(traceback.format_exc())
+        return 99
+    return 0
+
+
+def _log(text: str) -> None:
+    os.writev(2, [text.encode()])  # not `write`, which a test may let fail
 
 
 def run(work: Callable[[Acknowledge], Any], log: Path, setting: str = "") -> tuple[int, list[Any]]:
@@ -113,4 +124,4 @@ def end_all() -> None:
 
 
 def _say(pipe: int, value: Any) -> None:
-    os.writev(pipe, [(json.dumps(value) + "\n").encode()])  # not `write`, which a test may let fail
+    os.writev(pipe, [(json.dumps(value) + "\n").encode()])
