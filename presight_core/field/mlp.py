@@ -1,12 +1,15 @@
 """Multilayer perceptrons of which every sub-field has its own weights."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
+
+BLOCK_ROWS = 4096  # of 64 float32: 1 MiB, so that a layer finds most of the one before it in the cache
 
 
 class SubFieldMlp(nn.Module):
@@ -29,6 +32,10 @@ class SubFieldMlp(nn.Module):
         self, inputs: Float[Tensor, "points inputs"], segments: Sequence[int]
     ) -> Float[Tensor, "points outputs"]:
         """Outputs of each row; rows segments[s]..segments[s + 1] go through sub-field s."""
+        if inputs.device.type == "cpu":
+            return _BlockwiseLayers.apply(  # type: ignore[return-value]
+                inputs, segments, self.dtype, torch.is_grad_enabled(), *self.weights, *self.biases
+            )
         layers = [
             (weight.to(self.dtype).unbind(0), bias.to(self.dtype).unbind(0))
             for weight, bias in zip(self.weights, self.biases, strict=True)
@@ -41,3 +48,61 @@ class SubFieldMlp(nn.Module):
                 values = functional.linear(values, weight[sub_field], bias[sub_field])
             outputs.append(values)
         return outputs[0] if len(outputs) == 1 else torch.cat(outputs)
+
+
+class _BlockwiseLayers(torch.autograd.Function):
+    """All layers of a block of rows, then the next block: on a CPU layers pass their values on in the cache."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, inputs: Tensor, segments: Sequence[int], dtype: torch.dtype, remember: bool, *parameters: Tensor
+    ) -> Tensor:
+        cast = [parameter.to(dtype) for parameter in parameters]
+        weights, biases = cast[: len(cast) // 2], cast[len(cast) // 2 :]
+        outputs = inputs.new_empty(len(inputs), weights[-1].shape[1], dtype=dtype)
+        ctx.values, ctx.segments, ctx.inputs_type = [], segments, inputs.dtype
+        ctx.save_for_backward(*weights)
+        for sub_field, first, last in _blocks(segments):
+            values = [inputs[first:last].to(dtype)]
+            for number, (weight, bias) in enumerate(zip(weights, biases, strict=True), 1):
+                into = outputs[first:last] if number == len(weights) else None
+                result = torch.addmm(bias[sub_field], values[-1], weight[sub_field].T, out=into)
+                values.append(result if into is not None else result.relu_())
+            if remember:
+                ctx.values.append(values[:-1])
+        return outputs
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        weights = ctx.saved_tensors
+        of_weights = [torch.zeros_like(weight, dtype=torch.float32) for weight in weights]
+        of_biases = [weight.new_zeros(weight.shape[:2], dtype=torch.float32) for weight in weights]
+        of_inputs = None
+        if ctx.needs_input_grad[0]:
+            of_inputs = gradients[0].new_empty(len(gradients[0]), weights[0].shape[2], dtype=ctx.inputs_type)
+        for (sub_field, first, last), values in zip(_blocks(ctx.segments), ctx.values, strict=True):
+            gradient = gradients[0][first:last]
+            for number in reversed(range(len(weights))):
+                _add_product(of_weights[number][sub_field], gradient, values[number])
+                of_biases[number][sub_field] += gradient.sum(0)
+                if number:
+                    gradient = gradient @ weights[number][sub_field]
+                    gradient = torch.ops.aten.threshold_backward(gradient, values[number], 0)
+                elif of_inputs is not None:
+                    of_inputs[first:last] = gradient @ weights[0][sub_field]
+        return of_inputs, None, None, None, *of_weights, *of_biases
+
+
+def _blocks(segments: Sequence[int]) -> Iterator[tuple[int, int, int]]:
+    """Sub-field, first row and end of each block."""
+    for sub_field, (start, end) in enumerate(pairwise(segments)):
+        for first in range(start, end, BLOCK_ROWS):
+            yield sub_field, first, min(first + BLOCK_ROWS, end)
+
+
+def _add_product(total: Tensor, gradient: Tensor, values: Tensor) -> None:
+    """Add gradient.T @ values; totals of many blocks are float32, whatever the layers calculate in."""
+    if gradient.dtype == total.dtype:
+        total.addmm_(gradient.T, values)
+    else:
+        total += gradient.T @ values
