@@ -16,6 +16,7 @@ from zarr.storage import ObjectStore as ZarrStore
 from zarr.storage import WrapperStore
 
 from presight_core.errors import ConflictError
+from presight_core.failpoints import failpoint
 from presight_core.grid import morton
 from presight_core.priors.documents import CityDocument, TileEntry, lattice_to_json, tile_path
 from presight_core.priors.schema import (
@@ -152,6 +153,7 @@ class _ArrayWriter:
         first = self.array.shape[0]
         self.digest.update(np.ascontiguousarray(rows).astype(rows.dtype.newbyteorder("<"), copy=False).data)
         with storing(self.array.path):
+            failpoint("slab-before-write")
             self.array.resize((first + len(rows), *self.array.shape[1:]))
             self.array[first:] = rows
 

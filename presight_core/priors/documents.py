@@ -122,6 +122,7 @@ class Generation:
     space_id: str
     tiling: dict[str, Any]  # `Tiling.to_json` of the registry that the tiles belong to
     tiles: dict[str, GenerationTile]  # by tile id
+    fence: int = 0  # greatest fencing number of any publisher so far; who holds a smaller one is refused
 
     def to_json(self) -> dict[str, Any]:
         """The generation as JSON values."""
@@ -131,6 +132,7 @@ class Generation:
             "parent": self.parent,
             "city": self.city,
             "space_id": self.space_id,
+            "fence": self.fence,
             "tiling": self.tiling,
             "tiles": {tile_id: tile.to_json() for tile_id, tile in sorted(self.tiles.items())},
         }
@@ -139,8 +141,8 @@ class Generation:
     def from_json(value: Mapping[str, Any]) -> "Generation":
         """The generation that `to_json` wrote."""
         tiles = {tile_id: GenerationTile.from_json(tile) for tile_id, tile in value["tiles"].items()}
-        number, parent = value["generation"], value["parent"]
-        return Generation(number, parent, value["city"], value["space_id"], value["tiling"], tiles)
+        number, parent, fence = value["generation"], value["parent"], value.get("fence", 0)
+        return Generation(number, parent, value["city"], value["space_id"], value["tiling"], tiles, fence)
 
 
 def lattice_to_json(lattice: Lattice) -> dict[str, Any]:
