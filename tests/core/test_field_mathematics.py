@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -112,6 +114,13 @@ def random_histogram(bins: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     edges = torch.rand(6, bins + 1, generator=generator, dtype=torch.float64).sort(-1).values
     weights = torch.rand(6, bins, generator=generator, dtype=torch.float64)
     return edges, weights / weights.sum(-1, keepdim=True)
+
+
+def test_the_ground_loss_is_the_missing_weight_beyond_the_start_of_the_ground():
+    weights = torch.tensor([[0.25, 0.5, 0.0], [0.0, 0.0, 0.0]])
+    middles_m = torch.tensor([[1.0, 2.0, 3.0]]).expand(2, 3)
+    loss = losses.ground_loss(weights, middles_m, torch.tensor([1.5, 0.0]))
+    assert loss.item() == pytest.approx(-math.log(0.5) / 2)  # the second ray knows of no ground
 
 
 def test_distortion_equals_the_sum_over_all_pairs():
