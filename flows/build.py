@@ -34,12 +34,12 @@ def build_city(
     workspace = Workspace.open(folder).require()
     reconcile(workspace, city)
     plan = plan_city(workspace, city, load_city_settings(workspace.city_file(city), overrides))
-    if plan.stale:
+    if not plan.is_current:
         if not wait:
             workspace.catalog().leases.require_free(city)  # said now, not after the flow took its time to start
         outcome = _run(workspace, plan, overrides, parallel, wait)
     else:
-        outcome = {"generation": plan.generation, "published": [], "failed": {}}
+        outcome = {"generation": plan.generation, "published": [], "failed": {}, "withdrawn": {}}
     outcome["seconds"] = round(time.monotonic() - started, 1)
     if as_json:
         print_json(outcome)
@@ -70,11 +70,13 @@ def _exit(number: int, _frame: Any) -> NoReturn:
 
 
 def _print(city: str, outcome: dict[str, Any]) -> None:
-    if not outcome["published"] and not outcome["failed"]:
+    if not outcome["published"] and not outcome["failed"] and not outcome["withdrawn"]:
         print(f"{city}: nothing stale; generation {outcome['generation']} is current ({outcome['seconds']} s)")
         return
     for tile_id, error in outcome["failed"].items():
         print(f"{tile_id}: failed: {error.splitlines()[0]}")
+    for tile_id, why in outcome["withdrawn"].items():
+        print(f"{tile_id}: withdrawn, the prior has a hole there: {why}")
     tiles = ", ".join(outcome["published"]) or "no tile"
     print(f"{city}: published {tiles} as generation {outcome['generation']} ({outcome['seconds']} s)")
     print(f"next: presight status {city}; presight report {city}")

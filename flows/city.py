@@ -42,8 +42,10 @@ def rebuild_city(
         if plan.stale and plan.space_id is None:
             _fit_space(opened, plan, threads, lease)
             plan = plan_city(opened, city, settings)
+        if plan.is_current:
+            return {"generation": plan.generation, "published": [], "failed": {}, "withdrawn": {}}
         if not plan.stale:
-            return {"generation": plan.generation, "published": [], "failed": {}}
+            return publish(opened, plan, [], {}, lease)
         freeze(opened, plan, lease)
         broken = _extract_features(opened, plan, threads, lease)
         built, failed = _build_tiles(tile_jobs(opened, plan, threads, devices or ["cpu"], lease), broken)

@@ -18,6 +18,8 @@ app = typer.Typer(
 
 catalog_commands = typer.Typer(help="Look after the catalog.", no_args_is_help=True)
 app.add_typer(catalog_commands, name="catalog")
+drive_commands = typer.Typer(help="The drives of the cities.", no_args_is_help=True)
+app.add_typer(drive_commands, name="drives")
 
 City = Annotated[
     str, typer.Argument(help="City: the log location, for example singapore-onenorth.", show_default=False)
@@ -91,6 +93,31 @@ def build(
     from flows.build import build_city
 
     build_city(context.obj, city, override or [], parallel, as_json, wait)
+
+
+@drive_commands.command("list")
+def list_drives(
+    context: typer.Context,
+    city: Annotated[str | None, typer.Argument(help="City; all cities if not given.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List drives with their part of the split, also those that were removed."""
+    from flows.drives import show_drives
+
+    show_drives(context.obj, city, as_json)
+
+
+@drive_commands.command("remove")
+def remove_drive(
+    context: typer.Context,
+    drive: Annotated[str, typer.Argument(help="Name or id of a drive.", show_default=False)],
+    wait: Annotated[bool, typer.Option("--wait", help="Wait while a run builds the city, rather than refuse.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Take a drive out of its city: the next generation does not contain it. Its data are left alone."""
+    from flows.drives import show_removal
+
+    show_removal(context.obj, drive, wait, as_json)
 
 
 @catalog_commands.command("rebuild")

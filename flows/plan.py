@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from flows.console import print_json, print_table
+from flows.drives import CityDrives, choose_drives, require_split_apart
 from presight_core.config import CitySettings, load_city_settings
 from presight_core.drives import Drive, FrameTable
-from presight_core.errors import NotFoundError
+from presight_core.errors import InputError, NotFoundError
 from presight_core.grid import Lattice
 from presight_core.model_card import ModelCard
 from presight_core.priors.documents import Generation
@@ -54,14 +55,25 @@ class CityPlan:
 
     city: str
     settings: CitySettings
-    drives: tuple[Drive, ...]
+    known: CityDrives
     tiling: Tiling
     lattice: Lattice
     space_id: str | None  # None: no feature space fitted yet
     features: Recipe | None
     tiles: tuple[TilePlan, ...]
     skipped: tuple[str, ...]  # tiles with too few frames
+    withdrawn: dict[str, str]  # published tiles that contain a barred drive and cannot be built without it, and why
     generation: int | None
+
+    @property
+    def drives(self) -> tuple[Drive, ...]:
+        """The drives that make the prior, by capture time."""
+        return self.known.builders
+
+    @property
+    def is_current(self) -> bool:
+        """Whether there is nothing to build and nothing to withdraw."""
+        return not self.stale and not self.withdrawn
 
     @property
     def stale(self) -> tuple[TilePlan, ...]:
@@ -70,23 +82,25 @@ class CityPlan:
 
 
 def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPlan:
-    """The plan of a city under the given settings. Raises NotFoundError for a city without drives."""
+    """The plan of a city under the given settings.
+
+    Raises NotFoundError for a city without drives, InputError where none may make a prior or the split overlaps.
+    """
     catalog = workspace.catalog()
-    drives = tuple(catalog.drives(city))
-    if not drives:
-        known = ", ".join(catalog.cities()) or "none yet"
-        raise NotFoundError(
-            f"{city}: no drives in {workspace.root}; cities known here: {known}; ingest its drives first"
-        )
-    frames = city_frames(workspace.drives(), drives, settings)
-    city_tiling = _tiling(catalog.tiling(city), city, frames, settings)
+    known = choose_drives(catalog.drive_records(city), settings.split)
+    generation = workspace.store().generation(city)
+    if not known.builders and generation is None:
+        raise _no_drives(workspace, city, known)
+    require_split_apart(city, workspace.drives(), known, settings.split)
+    frames = city_frames(workspace.drives(), known.builders, settings) if known.builders else None
+    city_tiling = _tiling(catalog.tiling(city), city, frames, generation, settings)
     space_id = workspace.artifacts().pinned_space(space_key(settings))
     features = features_recipe(settings, space_id) if space_id else None
-    generation = workspace.store().generation(city)
     past = {build.tile_id: build for build in catalog.builds(city)}
     lattice = Lattice()
     tiles, skipped = [], []
-    for index, tile in enumerate(city_tiling.tiles):
+    for index, tile in enumerate(city_tiling.tiles if frames else ()):
+        assert frames is not None
         members = tile_frames(frames, city_tiling, index, settings)
         if len(members) < MIN_FRAMES:
             skipped.append(f"{tile.tile_id}: {len(members)} frames, at least {MIN_FRAMES} are needed")
@@ -95,10 +109,36 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
             (None, None) if features is None else _recipes(city_tiling, index, members, settings, features)
         )
         tiles.append(_tile_plan(index, tile.tile_id, members, (training, recipe), generation, past.get(tile.tile_id)))
-    number = generation.number if generation else None
     return CityPlan(
-        city, settings, drives, city_tiling, lattice, space_id, features, tuple(tiles), tuple(skipped), number
+        city=city,
+        settings=settings,
+        known=known,
+        tiling=city_tiling,
+        lattice=lattice,
+        space_id=space_id,
+        features=features,
+        tiles=tuple(tiles),
+        skipped=tuple(skipped),
+        withdrawn=_withdrawn(generation, known, {tile.tile_id for tile in tiles}),
+        generation=generation.number if generation else None,
     )
+
+
+def _no_drives(workspace: Workspace, city: str, known: CityDrives) -> InputError | NotFoundError:
+    if known.parts:
+        return InputError(
+            f"{city}: none of its {len(known.parts)} drives makes a prior; see `presight drives list {city}` and the "
+            f"split in {workspace.city_file(city)}"
+        )
+    cities = ", ".join(workspace.catalog().cities()) or "none yet"
+    return NotFoundError(f"{city}: no drives in {workspace.root}; cities known here: {cities}; ingest its drives first")
+
+
+def _withdrawn(generation: Generation | None, known: CityDrives, planned: set[str]) -> dict[str, str]:
+    """Tiles that may not be shown any longer and have too few frames of other drives to be built without them."""
+    shown = generation.tiles if generation else {}
+    tainted = {tile_id: known.why_barred(tile.entry.drives) for tile_id, tile in shown.items()}
+    return {tile_id: why for tile_id, why in sorted(tainted.items()) if why and tile_id not in planned}
 
 
 def city_frames(index: DriveIndex, drives: tuple[Drive, ...], settings: CitySettings) -> FrameTable:
@@ -134,8 +174,13 @@ def features_recipe(settings: CitySettings, space_id: str) -> Recipe:
     return Recipe("features", versions.FEATURES, chosen, models)
 
 
-def _tiling(frozen: Tiling | None, city: str, frames: FrameTable, settings: CitySettings) -> Tiling:
+def _tiling(
+    frozen: Tiling | None, city: str, frames: FrameTable | None, generation: Generation | None, settings: CitySettings
+) -> Tiling:
     """The city's frozen tiling, with new tiles founded on new ground; the first one if there is none."""
+    if frames is None:
+        assert generation is not None
+        return frozen or Tiling.from_json(generation.tiling)
     if frozen is None:
         return tiling.cut_city(city, frames.positions, settings.tiling)
     return tiling.extend_tiling(frozen, frames.positions, settings.tiling)

@@ -47,7 +47,8 @@ def publish(
     """
     store, catalog = workspace.store(), workspace.catalog()
     old = store.generation(plan.city)
-    accepted, errors = [], {tile_id: error for tile_id, (_, error) in failed.items()}
+    accepted: list[Built] = []
+    errors = {tile_id: error for tile_id, (_, error) in failed.items()}
     for tile in built:
         problems = _problems(store, plan, tile, old)
         if problems:
@@ -56,13 +57,15 @@ def publish(
         else:
             accepted.append(tile)
     number = plan.generation
-    if accepted:
+    withdrawn = _withdrawn(plan, old, {tile.job.tile_id for tile in accepted})
+    if accepted or withdrawn:
         names = {drive.drive_id: drive.name for drive in plan.drives}
         rows = {build.build_id: build for build in catalog.running(plan.city)}
         now = catalog.now()
-        tiles = {
+        tiles: dict[str, GenerationTile | None] = {
             tile.job.tile_id: remember_build(tile.tile(names), rows.get(tile.job.build_id), now) for tile in accepted
         }
+        tiles |= dict.fromkeys(withdrawn)
         failpoint("publish-before")
         # In this order: whoever takes the lease after this line raises the fence before they do anything else.
         catalog.leases.require(lease)
@@ -71,18 +74,36 @@ def publish(
         for tile in accepted:
             metrics = {**tile.metrics, "generation": number}
             catalog.finish_build(tile.job.build_id, "published", metrics, finished_at=now)
+        for tile_id in withdrawn:
+            catalog.withdraw_tile(plan.city, tile_id)
     for job, error in failed.values():
         catalog.finish_build(job.build_id, "failed", {}, error)
     return {
         "generation": number,
         "published": [tile.job.tile_id for tile in accepted],
         "failed": errors,
+        "withdrawn": withdrawn,
     }
+
+
+def _withdrawn(plan: CityPlan, old: Generation | None, accepted: set[str]) -> dict[str, str]:
+    """Shown tiles that contain a drive which no prior may contain, and were not built anew, with the reason.
+
+    A hole in the prior is seen and mended; a drive that its owner took back, or that tests a model, must not stay.
+    """
+    shown = old.tiles if old else {}
+    tainted = {tile_id: plan.known.why_barred(tile.entry.drives) for tile_id, tile in shown.items()}
+    return {tile_id: why for tile_id, why in sorted(tainted.items()) if why and tile_id not in accepted}
 
 
 def _problems(store: PriorStore, plan: CityPlan, tile: Built, old: Generation | None) -> tuple[str, ...]:
     """Why a built tile may not be published."""
     shown = old.tiles.get(tile.job.tile_id) if old else None
+    barred = plan.known.why_barred(tile.tile().entry.drives)
+    if barred:
+        return (barred,)
+    if shown and plan.known.why_barred(shown.entry.drives):
+        shown = None  # what a barred drive alone saw is meant to be lost
     new_summary = store.summary(plan.city, tile.tile())
     old_summary = store.summary(plan.city, shown) if shown else None
     return validate_tile(new_summary, tile.metrics, old_summary, plan.settings.validation)

@@ -156,10 +156,24 @@ class ValidationSettings(Settings):
     min_coverage: Share = 0.8  # share of the old tile's observed columns that the new one must keep
 
 
+class SplitSettings(Settings):
+    """Which drives are for what, by scene name or pattern ("scene-00*"). Drives of the test part never make a prior."""
+
+    named: Literal["paper"] | None = None  # a split that ships with PreSight; instead of the lists
+    train: tuple[str, ...] = ()
+    prior: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    rest: Literal["train", "prior", "test"] | None = None  # part of drives on no list; None: prior without any split
+    build_from: tuple[Literal["train", "prior"], ...] = ("train", "prior")  # parts whose drives make the prior
+    overlap_m: Metres = 30.0  # half the length of the window that maps are drawn in: nearer places show the same ground
+    allow_overlap: bool = False  # of the ground of train and test drives
+
+
 class CitySettings(Settings):
     """Everything that decides a city's priors."""
 
     preset: Literal["demo", "fast", "default", "paper"] = "default"
+    split: SplitSettings = SplitSettings()
     features: FeatureSettings = FeatureSettings()
     tiling: TilingSettings = TilingSettings()
     field: FieldSettings = FieldSettings()

@@ -24,6 +24,15 @@ Ending = Literal["built", "published", "failed"]
 
 
 @dataclass(frozen=True)
+class DriveRecord:
+    """A drive that the catalog knows, in its city or taken out of it. Times are UTC, ISO 8601."""
+
+    drive: "Drive"
+    added_at: str
+    removed_at: str | None
+
+
+@dataclass(frozen=True)
 class Build:
     """One attempt to build a tile. Times are UTC, ISO 8601."""
 
@@ -32,7 +41,7 @@ class Build:
     tile_id: str
     recipe: dict[str, Any]
     recipe_digest: str
-    state: str  # "running", then "built" or "failed"; "published" after "built"
+    state: str  # "running", then "built" or "failed"; "published" after "built"; "withdrawn" if shown no more
     stage: str  # what it does, or did last
     done: int
     total: int  # 0: not yet known
@@ -113,6 +122,15 @@ class Catalog:
                 city=city,
             )
         return [Drive(**row) for row in rows]
+
+    def drive_records(self, city: str | None = None) -> list[DriveRecord]:
+        """Every drive that ever was in a city, or in any, also those taken out, by capture time."""
+        from presight_core.drives import Drive
+
+        with self._database.reading() as query:
+            rows = query(DRIVE_RECORDS, city=city)
+        times = [(row.pop("added_at"), row.pop("removed_at")) for row in rows]
+        return [DriveRecord(Drive(**row), *both) for row, both in zip(rows, times, strict=True)]
 
     def cities(self) -> list[str]:
         """Every city with a drive, sorted."""
@@ -216,6 +234,11 @@ class Catalog:
                     raise ConflictError(f"build {build_id} was ended before, as failed; run `presight build` again")
                 raise NotFoundError(f"no build {build_id}; start it with start_build")
 
+    def withdraw_tile(self, city: str, tile_id: str) -> None:
+        """Record that the city shows no build of a tile any more."""
+        with self._database.writing() as query:
+            query(WITHDRAW, city=city, tile_id=tile_id, now=self._now())
+
     def builds(self, city: str, state: str | None = None) -> list[Build]:
         """The latest build of every tile of a city, by tile; of those in `state`, if given."""
         with self._database.reading() as query:
@@ -265,6 +288,7 @@ def _build(row: Mapping[str, Any]) -> Build:
 ADD_DRIVE = """
     INSERT INTO drives (drive_id, name, city, root, version, captured, frame_count, start_us, end_us, added_at)
     VALUES (:drive_id, :name, :city, :root, :version, :captured, :frame_count, :start_us, :end_us, :added_at)"""
+DRIVE_RECORDS = "SELECT * FROM drives WHERE city = COALESCE(:city, city) ORDER BY start_us, drive_id"
 REPLACE_DRIVE = """
     UPDATE drives SET name = :name, root = :root, version = :version, captured = :captured, removed_at = NULL
     WHERE drive_id = :drive_id"""
@@ -302,6 +326,9 @@ FINISH_BUILD = """
     UPDATE builds SET state = :state, metrics = COALESCE(:metrics, metrics), error = :error, updated_at = :now,
                       finished_at = :now
     WHERE build_id = :build_id AND state <> 'failed' RETURNING build_id"""
+WITHDRAW = """
+    UPDATE builds SET state = 'withdrawn', updated_at = :now
+    WHERE city = :city AND tile_id = :tile_id AND state = 'published'"""
 LATEST_BUILDS = """
     SELECT * FROM builds WHERE build_id IN
     (SELECT MAX(build_id) FROM builds WHERE city = :city AND state = COALESCE(:state, state) GROUP BY tile_id)

@@ -81,7 +81,7 @@ class PriorStore:
     def publish(
         self,
         city: str,
-        tiles: Mapping[str, GenerationTile],
+        tiles: Mapping[str, GenerationTile | None],
         parent: int | None,
         tiling: Mapping[str, Any] | None = None,
         fence: int | None = None,
@@ -89,9 +89,10 @@ class PriorStore:
         """Publish builds as one new generation; its number.
 
         `parent` is the generation that the builds were planned on (None: the city had none), and the new
-        one keeps its other tiles. If others published meanwhile, their tiles are kept too. `tiling`
-        (`Tiling.to_json`) is needed for the first generation; tiles that a new tiling has not, or has
-        elsewhere, are no longer shown. `fence` is the fencing number of the publisher's lease, if it has one.
+        one keeps its other tiles; None for a tile takes it away. If others published meanwhile, their tiles are
+        kept too. `tiling` (`Tiling.to_json`) is needed for the first generation; tiles that a new tiling has
+        not, or has elsewhere, are no longer shown. `fence` is the fencing number of the publisher's lease, if it
+        has one.
 
         Raises ConflictError if somebody else published one of the same tiles or another tiling meanwhile, or
         was given a greater fencing number,
@@ -233,8 +234,10 @@ class PriorStore:
         content = self._source.read(generation_path(generation.city, generation.number))
         return hashlib.sha256(content or b"").hexdigest()
 
-    def _check_builds(self, facts: CityDocument, tiles: Mapping[str, GenerationTile]) -> None:
+    def _check_builds(self, facts: CityDocument, tiles: Mapping[str, GenerationTile | None]) -> None:
         for tile_id, tile in tiles.items():
+            if tile is None:
+                continue
             path = f"{facts.city}/{tile.entry.path}"
             if tile.entry.space_id != facts.space_id:
                 raise ConflictError(
@@ -247,7 +250,7 @@ class PriorStore:
     def _check_meanwhile(
         self,
         city: str,
-        tiles: Mapping[str, GenerationTile],
+        tiles: Mapping[str, GenerationTile | None],
         parent: int | None,
         head: Generation | None,
         tiling: Mapping[str, Any] | None,
@@ -279,15 +282,15 @@ def _check_fence(city: str, head: Generation | None, fence: int | None) -> None:
 def _next(
     facts: CityDocument,
     head: Generation | None,
-    tiles: Mapping[str, GenerationTile],
+    tiles: Mapping[str, GenerationTile | None],
     tiling: Mapping[str, Any] | None,
 ) -> Generation:
-    """The generation after `head`: its tiles where the tiling still has them, and the new ones."""
+    """The generation after `head`: its tiles where the tiling still has them, and the new ones; None takes one away."""
     chosen = dict(tiling) if tiling else head.tiling if head else None
     if chosen is None:
         raise InputError(f"{facts.city}: the first generation needs the city's tiling; pass tiling=")
     places = _places(chosen)
-    unknown = sorted(tiles.keys() - places.keys())
+    unknown = sorted({tile_id for tile_id, tile in tiles.items() if tile} - places.keys())
     if unknown:
         raise InputError(f"{facts.city}: {', '.join(unknown)} not in tiling {chosen['tiling_id']}; plan again")
     kept: dict[str, GenerationTile] = {}
@@ -295,7 +298,8 @@ def _next(
         old = _places(head.tiling)
         kept = {tile_id: tile for tile_id, tile in head.tiles.items() if places.get(tile_id) == old[tile_id]}
     number, parent = (head.number + 1, head.number) if head else (1, None)
-    return Generation(number, parent, facts.city, facts.space_id, chosen, {**kept, **tiles})
+    shown = {tile_id: tile for tile_id, tile in {**kept, **tiles}.items() if tile is not None}
+    return Generation(number, parent, facts.city, facts.space_id, chosen, shown)
 
 
 def _places(tiling: Mapping[str, Any]) -> dict[str, Any]:

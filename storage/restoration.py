@@ -55,8 +55,10 @@ def restore(catalog: Catalog, index: DriveIndex, store: PriorStore) -> dict[str,
     counts = {"drives": len(drives), "tilings": 0, "builds": 0}
     for city in sorted({drive.city for drive in drives}):
         counts["tilings"] += _restore_tilings(catalog, store, city)
+        head = store.generation(city)
         for build in _published(store, city, catalog.now()):
-            catalog.restore_build(build)
+            is_shown = head is not None and build.tile_id in head.tiles
+            catalog.restore_build(build if is_shown else replace(build, state="withdrawn"))
             counts["builds"] += 1
     return counts
 

@@ -3,7 +3,7 @@
 Only the arithmetic is left out: the voxels of a tile are made up from its name, so that the truth is known.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -74,9 +74,10 @@ class ToyCity:
         reconcile(workspace, CITY)
         with hold_city(workspace, CITY, wait) as lease:
             plan = plan_city(workspace, CITY, settings)
-            if not plan.stale:
+            if plan.is_current:
                 return plan.generation
-            freeze(workspace, plan, lease)
+            if plan.stale:
+                freeze(workspace, plan, lease)
             built = [self._written(workspace, job) for job in tile_jobs(workspace, plan, 1, ["cpu"], lease).values()]
             return publish(workspace, plan, built, {}, lease)["generation"]
 
@@ -107,7 +108,7 @@ class ToyCity:
     def _written(self, workspace: Workspace, job) -> Built:
         name = TileName(job.tile_id, f"build-{job.build_id}")
         attributes = {"recipe": job.recipe, "space_id": job.space_id}
-        batches = self.example(job.tile_id).batches()
+        batches = replace(self.example(job.tile_id), drive_count=len(job.drive_ids)).batches()
         entry = workspace.store().write_tile(job.city, name, batches, sorted(job.drive_ids), attributes)
         return Built(job, {"metrics": {"psnr_db": 20.0}}, {"entry": entry.to_json(), "counts": {}, "seconds": 0.0})
 
