@@ -71,7 +71,7 @@ def ingest(
 @app.command()
 def plan(context: typer.Context, city: City, override: Overrides = None, as_json: AsJson = False) -> None:
     """Show a city's tiles, which are stale and why, and what building them costs."""
-    from flows.plan import show_plan
+    from flows.forecast import show_plan
 
     show_plan(context.obj, city, override or [], as_json)
 

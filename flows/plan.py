@@ -4,20 +4,20 @@ Planning reads and never writes; it imports neither torch nor Prefect.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from flows.console import print_json, print_table
 from flows.drives import CityDrives, choose_drives, require_split_apart
-from presight_core.config import CitySettings, load_city_settings
+from flows.staleness import Reason, stale_reasons
+from presight_core.config import CitySettings
 from presight_core.drives import Drive, FrameTable
 from presight_core.errors import InputError, NotFoundError
 from presight_core.grid import Lattice
 from presight_core.model_card import ModelCard
 from presight_core.priors.documents import Generation
-from presight_core.recipes import Recipe, differences
+from presight_core.recipes import Recipe
 from presight_core.tiles import Tiling
 from stages import tiling, versions
 from storage.catalog import Build
@@ -25,8 +25,6 @@ from storage.drives import DriveIndex
 from storage.workspace import Workspace
 
 MIN_FRAMES = 8  # fewer images than this cannot constrain a field; the tile is left out and said so
-PLAN_COLUMNS = ("tile", "drives", "frames", "state", "why", "last build")
-BYTES_PER_VOXEL = 80  # the format's upper bound at 64 channels, for the disk estimate
 
 
 @dataclass(frozen=True)
@@ -39,14 +37,20 @@ class TilePlan:
     frame_count: int
     training: Recipe | None  # None until the feature space exists
     recipe: Recipe | None  # the whole tile: training, then extraction
-    reasons: tuple[str, ...]
-    seconds: float | None  # what its last build took, if there was one
+    causes: tuple[Reason, ...]
+    past: Build | None  # its last build that was published
     voxel_count: int  # of the published build, 0 if none
+    bytes: int  # likewise
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is stale, in words."""
+        return tuple(cause.text for cause in self.causes)
 
     @property
     def is_stale(self) -> bool:
         """Whether a build would rebuild the tile."""
-        return bool(self.reasons)
+        return bool(self.causes)
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,8 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
     city_tiling = _tiling(catalog.tiling(city), city, frames, generation, settings)
     space_id = workspace.artifacts().pinned_space(space_key(settings))
     features = features_recipe(settings, space_id) if space_id else None
-    past = {build.tile_id: build for build in catalog.builds(city)}
+    past = {build.tile_id: build for build in catalog.builds(city, "published")}
+    compare = partial(stale_reasons, known=known, index=workspace.drives())
     lattice = Lattice()
     tiles, skipped = [], []
     for index, tile in enumerate(city_tiling.tiles if frames else ()):
@@ -108,7 +113,21 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
         training, recipe = (
             (None, None) if features is None else _recipes(city_tiling, index, members, settings, features)
         )
-        tiles.append(_tile_plan(index, tile.tile_id, members, (training, recipe), generation, past.get(tile.tile_id)))
+        shown = generation.tiles.get(tile.tile_id) if generation else None
+        tiles.append(
+            TilePlan(
+                tile=index,
+                tile_id=tile.tile_id,
+                drive_ids=tuple(np.unique(members.drive_id).tolist()),
+                frame_count=len(members),
+                training=training,
+                recipe=recipe,
+                causes=compare(shown.recipe if shown else None, recipe.to_json() if recipe else None),
+                past=past.get(tile.tile_id),
+                voxel_count=shown.entry.voxel_count if shown else 0,
+                bytes=shown.entry.bytes if shown else 0,
+            )
+        )
     return CityPlan(
         city=city,
         settings=settings,
@@ -204,101 +223,3 @@ def _recipes(
     training = Recipe("training", versions.TRAINING, chosen, inputs)
     whole = Recipe("tile", versions.EXTRACTION, {"extraction": values["extraction"]}, {"training": training.to_json()})
     return training, whole
-
-
-def _tile_plan(
-    index: int,
-    tile_id: str,
-    members: FrameTable,
-    recipes: tuple[Recipe | None, Recipe | None],
-    generation: Generation | None,
-    past: Build | None,
-) -> TilePlan:
-    published = generation.tiles.get(tile_id) if generation else None
-    if published is None:
-        reasons = ["never built"]
-    elif recipes[1] is None:
-        reasons = ["the feature space is not fitted"]
-    else:
-        reasons = [_readable(line) for line in differences(published.recipe, recipes[1].to_json())]
-    return TilePlan(
-        tile=index,
-        tile_id=tile_id,
-        drive_ids=tuple(np.unique(members.drive_id).tolist()),
-        frame_count=len(members),
-        training=recipes[0],
-        recipe=recipes[1],
-        reasons=tuple(reasons),
-        seconds=past.metrics.get("seconds") if past else None,
-        voxel_count=published.entry.voxel_count if published else 0,
-    )
-
-
-def _readable(difference: str) -> str:
-    """A recipe's difference without the nesting that the recipe needs."""
-    return difference.replace("inputs.training.", "").replace("inputs.", "").replace("settings.", "")
-
-
-def show_plan(folder: Path, city: str, overrides: list[str], as_json: bool) -> None:
-    """Print the plan of a city."""
-    workspace = Workspace.open(folder).require()
-    plan = plan_city(workspace, city, load_city_settings(workspace.city_file(city), overrides))
-    if as_json:
-        print_json(plan_json(plan))
-        return
-    rows = [
-        (
-            tile.tile_id,
-            len(tile.drive_ids),
-            tile.frame_count,
-            "stale" if tile.is_stale else "current",
-            "; ".join(tile.reasons),
-            f"{tile.seconds:.0f} s" if tile.seconds else "unknown",
-        )
-        for tile in plan.tiles
-    ]
-    print_table(f"{city}: {len(plan.stale)} of {len(plan.tiles)} tiles to build", PLAN_COLUMNS, rows)
-    for line in plan.skipped:
-        print(f"left out: {line}")
-    print(cost_line(plan))
-
-
-def plan_json(plan: CityPlan) -> dict[str, Any]:
-    """The plan as JSON values."""
-    return {
-        "city": plan.city,
-        "generation": plan.generation,
-        "drives": [drive.name for drive in plan.drives],
-        "tiling": plan.tiling.to_json(),
-        "space_id": plan.space_id,
-        "left_out": list(plan.skipped),
-        "tiles": [
-            {
-                "tile_id": tile.tile_id,
-                "drives": list(tile.drive_ids),
-                "frames": tile.frame_count,
-                "stale": tile.is_stale,
-                "reasons": list(tile.reasons),
-                "seconds_last_time": tile.seconds,
-                "voxels": tile.voxel_count,
-            }
-            for tile in plan.tiles
-        ],
-    }
-
-
-def cost_line(plan: CityPlan) -> str:
-    """What building the stale tiles takes, as far as past builds tell."""
-    if not plan.stale:
-        return f"nothing stale; generation {plan.generation} is current"
-    training = plan.settings.training
-    rays = training.steps * training.batch_rays * len(plan.stale)
-    known = [tile.seconds for tile in plan.stale if tile.seconds]
-    time = (
-        f"about {sum(known) / len(known) * len(plan.stale):.0f} s of tile time"
-        if known
-        else "time unknown (no past build)"
-    )
-    voxels = sum(tile.voxel_count for tile in plan.stale)
-    disk = f", about {voxels * BYTES_PER_VOXEL / 1e6:.0f} MB in the store" if voxels else ""
-    return f"cost: {rays / 1e6:,.1f} M rays, {time}{disk}; next: presight build {plan.city}"

@@ -1,12 +1,16 @@
 """The `presight` command as a user starts it: a process of its own."""
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from tests.torture.toy_city import ToyCity
 
 Presight = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -22,3 +26,20 @@ def presight(tmp_path_factory) -> Presight:
         return subprocess.run(text, capture_output=True, text=True, check=False, env=environment)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def city_template(tmp_path_factory) -> ToyCity:
+    """A city of two drives, both in its two published tiles."""
+    folder = tmp_path_factory.mktemp("city")
+    made = ToyCity(folder / "workspace", folder / "data", side_blocks=2)
+    made.prepare()
+    made.ingest()
+    assert made.build() == 1
+    return made
+
+
+@pytest.fixture
+def city(city_template: ToyCity, tmp_path: Path) -> ToyCity:
+    """A copy of the city that a test may change."""
+    return replace(city_template, root=Path(shutil.copytree(city_template.root, tmp_path / "workspace")))

@@ -101,7 +101,7 @@ def test_building_again_builds_nothing(built, presight):
 
 def test_a_changed_setting_makes_tiles_stale_and_is_named_as_the_reason(built):
     reasons = {reason for tile in plan_of(built, "training.steps=41").stale for reason in tile.reasons}
-    assert reasons == {"training.steps: 40 -> 41"}
+    assert reasons == {"setting training.steps: 40 -> 41"}
 
 
 def test_how_often_checkpoints_are_written_changes_nothing(built):

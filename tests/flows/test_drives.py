@@ -1,9 +1,5 @@
 """A drive that is removed, or is there to test, is in no generation that comes after."""
 
-import shutil
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -19,23 +15,6 @@ from storage.workspace import Workspace
 from tests.torture.toy_city import CITY, SETTINGS, ToyCity
 
 SPLIT = '[split]\ntrain = ["scene-0000"]\ntest = ["scene-0001"]\n'
-
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory) -> ToyCity:
-    """A city of two drives, both in its two published tiles."""
-    folder = tmp_path_factory.mktemp("city")
-    made = ToyCity(folder / "workspace", folder / "data", side_blocks=2)
-    made.prepare()
-    made.ingest()
-    assert made.build() == 1
-    return made
-
-
-@pytest.fixture
-def city(template: ToyCity, tmp_path: Path) -> ToyCity:
-    """A copy of the city that a test may change."""
-    return replace(template, root=Path(shutil.copytree(template.root, tmp_path / "workspace")))
 
 
 def plan_of(city: ToyCity):
