@@ -10,16 +10,15 @@ from prefect.task_runners import ThreadPoolTaskRunner
 
 from flows import tasks
 from flows.jobs import Job
-from flows.plan import CityPlan, plan_city
+from flows.plan import CityPlan, plan_city, record_plan
 from flows.publication import Built, publish
 from flows.reconcile import hold_city
 from presight_core.config import load_city_settings
 from presight_core.recipes import Recipe
 from storage.leases import Lease
 from storage.restoration import remember_tiling
+from storage.tile_states import CITY_ROW
 from storage.workspace import Workspace
-
-CITY_ROW = "all tiles"  # the catalog's row of what belongs to no tile: the feature space and the features
 
 
 @flow(name="rebuild_city", flow_run_name="rebuild {city}", persist_result=False)
@@ -42,6 +41,7 @@ def rebuild_city(
         if plan.stale and plan.space_id is None:
             _fit_space(opened, plan, threads, lease)
             plan = plan_city(opened, city, settings)
+        record_plan(opened, plan)
         if plan.is_current:
             return {"generation": plan.generation, "published": [], "failed": {}, "withdrawn": {}}
         if not plan.stale:

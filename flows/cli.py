@@ -144,12 +144,20 @@ def reconcile(
 def status(
     context: typer.Context,
     city: Annotated[str | None, typer.Argument(help="City; all cities if not given.")] = None,
+    tile: Annotated[
+        str | None, typer.Option("--tile", help="Only this tile of the city, with all its metrics.")
+    ] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Show it every second until nothing runs.")] = False,
+    exit_code: Annotated[
+        bool,
+        typer.Option("--exit-code", help="End with 6 if a tile failed, 7 while some are built, 8 if some are stale."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show the state of every tile."""
-    from flows.status import show_status
+    """Show the state of every tile, as the catalog has it."""
+    from flows.status import Request, show_status
 
-    show_status(context.obj, city, as_json)
+    sys.exit(show_status(context.obj, Request(city, tile, watch, exit_code, as_json)))
 
 
 @app.command()

@@ -33,7 +33,7 @@ def run_demo(folder: Path, overrides: list[str]) -> None:
     from flows.build import build_city
     from flows.ingest import ingest_root
     from flows.report import write_report
-    from flows.status import show_status
+    from flows.status import Request, show_status
 
     started = time.monotonic()
     _write_settings(Workspace.open(folder))
@@ -41,7 +41,7 @@ def run_demo(folder: Path, overrides: list[str]) -> None:
     generate_city(data, "demo", seed=0, overrides=[])
     ingest_root(folder, data, VERSION, keep_going=False, as_json=False)
     build_city(folder, CITY, overrides, parallel=None, as_json=False)
-    show_status(folder, CITY, as_json=False)
+    show_status(folder, Request(CITY))
     page = write_report(folder, CITY, None)
     print(f"done in {time.monotonic() - started:.0f} s; look at {page}")
     print(f"ask it:  presight --workspace {folder} query {CITY} --at X,Y,YAW --png prior.png")

@@ -64,9 +64,10 @@ def require_split_apart(city: str, index: DriveIndex, known: CityDrives, split: 
     require_apart(city, overlap(train_world, test_world, split.overlap_m), split.overlap_m)
 
 
-def remove_drive(workspace: Workspace, drive: str, wait: bool = False) -> Drive:
+def remove_drive(workspace: Workspace, drive: str, wait: bool = False) -> tuple[Drive, list[str]]:
     """Take a drive, by name or id, out of its city; from here on no new generation contains it.
 
+    The drive, and the tiles that are shown with it and stale now.
     It holds the city meanwhile, so that no build which planned with the drive publishes afterwards. Raises
     LeaseHeldError while one runs, unless `wait`; NotFoundError, InputError for a name that is none or two.
     """
@@ -77,7 +78,11 @@ def remove_drive(workspace: Workspace, drive: str, wait: bool = False) -> Drive:
         with suppress(NotFoundError):  # caches that were cleared cannot bring it back either
             workspace.drives().mark_removed(found.drive_id, removed_at)
         catalog.remove_drive(found.drive_id, removed_at)
-    return found
+        generation = workspace.store().generation(found.city)
+        shown = generation.tiles if generation else {}
+        tiles = sorted(tile_id for tile_id, tile in shown.items() if found.drive_id in tile.entry.drives)
+        catalog.tile_states.mark_stale(found.city, tiles, f"drive {found.name} was removed")
+    return found, tiles
 
 
 def find_drive(drives: Sequence[Drive], name_or_id: str) -> Drive:
@@ -109,10 +114,7 @@ def show_drives(folder: Path, city: str | None, as_json: bool) -> None:
 def show_removal(folder: Path, drive: str, wait: bool, as_json: bool) -> None:
     """Remove a drive and say which tiles contain it still."""
     workspace = Workspace.open(folder).require()
-    removed = remove_drive(workspace, drive, wait)
-    generation = workspace.store().generation(removed.city)
-    shown = generation.tiles if generation else {}
-    tiles = sorted(tile_id for tile_id, tile in shown.items() if removed.drive_id in tile.entry.drives)
+    removed, tiles = remove_drive(workspace, drive, wait)
     if as_json:
         print_json({"drive": asdict(removed), "stale": tiles})
         return

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.console import print_json, print_table
-from flows.plan import CityPlan, TilePlan, plan_city
+from flows.plan import CityPlan, TilePlan, plan_city, record_plan
 from presight_core.config import load_city_settings
 from storage.workspace import Workspace
 
@@ -65,6 +65,8 @@ def show_plan(folder: Path, city: str, overrides: list[str], as_json: bool) -> N
     """Print the plan of a city."""
     workspace = Workspace.open(folder).require()
     plan = plan_city(workspace, city, load_city_settings(workspace.city_file(city), overrides))
+    if not overrides:  # else it is not the plan of the city as it is set up
+        record_plan(workspace, plan)
     cost = forecast(workspace, plan)
     if as_json:
         print_json(plan_json(plan, cost))

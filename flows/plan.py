@@ -1,6 +1,6 @@
-"""What a build of a city would do: its tiles, which are stale and why, and what that costs.
+"""What a build of a city would do: its tiles, which are stale and why.
 
-Planning reads and never writes; it imports neither torch nor Prefect.
+Planning reads and never writes, but for `record_plan`; it imports neither torch nor Prefect.
 """
 
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from presight_core.tiles import Tiling
 from stages import tiling, versions
 from storage.catalog import Build
 from storage.drives import DriveIndex
+from storage.tile_states import PlannedTile
 from storage.workspace import Workspace
 
 MIN_FRAMES = 8  # fewer images than this cannot constrain a field; the tile is left out and said so
@@ -158,6 +159,23 @@ def _withdrawn(generation: Generation | None, known: CityDrives, planned: set[st
     shown = generation.tiles if generation else {}
     tainted = {tile_id: known.why_barred(tile.entry.drives) for tile_id, tile in shown.items()}
     return {tile_id: why for tile_id, why in sorted(tainted.items()) if why and tile_id not in planned}
+
+
+def record_plan(workspace: Workspace, plan: CityPlan) -> None:
+    """Let `presight status` say what the plan says."""
+    tiles = [
+        PlannedTile(
+            tile.tile_id,
+            "; ".join(tile.reasons),
+            tile.recipe.digest if tile.recipe else "",
+            len(tile.drive_ids),
+            tile.frame_count,
+        )
+        for tile in plan.tiles
+    ]
+    tiles += [PlannedTile(tile_id, f"to be withdrawn: {why}", "", 0, 0) for tile_id, why in plan.withdrawn.items()]
+    catalog = workspace.catalog()
+    catalog.tile_states.save_plan(plan.city, tiles, catalog.now())
 
 
 def city_frames(index: DriveIndex, drives: tuple[Drive, ...], settings: CitySettings) -> FrameTable:

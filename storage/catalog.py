@@ -13,6 +13,7 @@ from presight_core.errors import ConflictError, InputError, NotFoundError
 from storage.database import Database, Query, open_database
 from storage.leases import Clock, Lease, Leases, require_current, text_of
 from storage.migrations import HEAD
+from storage.tile_states import TileStates, record_end, record_progress, record_start, record_withdrawal
 
 if TYPE_CHECKING:  # these import numpy, which `presight status` has no time for
     from presight_core.drives import Drive, Reject
@@ -66,6 +67,7 @@ class Catalog:
         self._database = database
         self._clock = clock
         self.leases = Leases(database, clock)
+        self.tile_states = TileStates(database)
 
     @staticmethod
     def open(url: str, clock: Clock = utc_now) -> "Catalog":
@@ -204,15 +206,19 @@ class Catalog:
         with self._database.writing() as query:
             if lease:
                 require_current(query, lease)
-            token = lease.token if lease else None
-            return query(START_BUILD, **values, token=token, now=self._now())[0]["build_id"]
+            token, now = lease.token if lease else None, self._now()
+            record_start(query, city, tile_id, now)
+            return query(START_BUILD, **values, token=token, now=now)[0]["build_id"]
 
     def progress(self, build_id: int, progress: "Progress") -> bool:
         """Record where a running build is; False for a build that has ended, which stays as it is."""
         values = {"stage": progress.stage, "done": int(progress.done), "total": int(progress.total)}
         values |= {"figures": json.dumps(progress.figures), "now": self._now()}
         with self._database.writing() as query:
-            return bool(query(PROGRESS, build_id=build_id, **values))
+            for build in query(PROGRESS, build_id=build_id, **values):
+                record_progress(query, build, values)
+                return True
+            return False
 
     def finish_build(
         self,
@@ -229,7 +235,11 @@ class Catalog:
         encoded = None if metrics is None else json.dumps(dict(metrics))
         with self._database.writing() as query:
             values = {"build_id": build_id, "state": state, "metrics": encoded, "error": error}
-            if not query(FINISH_BUILD, **values, now=finished_at or self._now()):
+            now = finished_at or self._now()
+            ended = query(FINISH_BUILD, **values, now=now)
+            for build in ended:
+                record_end(query, build, json.loads(build["metrics"]), now)
+            if not ended:
                 if query("SELECT 1 FROM builds WHERE build_id = :build_id", build_id=build_id):
                     raise ConflictError(f"build {build_id} was ended before, as failed; run `presight build` again")
                 raise NotFoundError(f"no build {build_id}; start it with start_build")
@@ -237,7 +247,9 @@ class Catalog:
     def withdraw_tile(self, city: str, tile_id: str) -> None:
         """Record that the city shows no build of a tile any more."""
         with self._database.writing() as query:
-            query(WITHDRAW, city=city, tile_id=tile_id, now=self._now())
+            now = self._now()
+            query(WITHDRAW, city=city, tile_id=tile_id, now=now)
+            record_withdrawal(query, city, tile_id, now)
 
     def builds(self, city: str, state: str | None = None) -> list[Build]:
         """The latest build of every tile of a city, by tile; of those in `state`, if given."""
@@ -253,6 +265,8 @@ class Catalog:
         }
         with self._database.writing() as query:
             query(RESTORE_BUILD, **{name: value for name, value in values.items() if name != "build_id"})
+            record_start(query, build.city, build.tile_id, build.started_at)
+            record_end(query, vars(build), build.metrics, build.updated_at)
 
     def running(self, city: str) -> list[Build]:
         """Builds of a city that are not ended."""
@@ -321,11 +335,12 @@ RESTORE_BUILD = """
             :started_at, :updated_at, :finished_at, :lease_token)"""
 PROGRESS = """
     UPDATE builds SET stage = :stage, done = :done, total = :total, figures = :figures, updated_at = :now
-    WHERE build_id = :build_id AND state = 'running' RETURNING build_id"""
+    WHERE build_id = :build_id AND state = 'running' RETURNING city, tile_id"""
 FINISH_BUILD = """
     UPDATE builds SET state = :state, metrics = COALESCE(:metrics, metrics), error = :error, updated_at = :now,
                       finished_at = :now
-    WHERE build_id = :build_id AND state <> 'failed' RETURNING build_id"""
+    WHERE build_id = :build_id AND state <> 'failed'
+    RETURNING city, tile_id, state, error, metrics, recipe_digest"""
 WITHDRAW = """
     UPDATE builds SET state = 'withdrawn', updated_at = :now
     WHERE city = :city AND tile_id = :tile_id AND state = 'published'"""

@@ -109,7 +109,8 @@ def test_ingesting_again_is_a_no_op(workspace, tiny, presight):
 
 def test_status_lists_a_city_before_anything_is_built(workspace, presight):
     result = presight(workspace, "status", "--json")
-    assert json.loads(result.stdout) == {"toytown": []}
+    (city,) = json.loads(result.stdout)["cities"]
+    assert (city["city"], city["drives"], city["states"], city["plan_is_outdated"]) == ("toytown", 2, {}, True)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 
 from flows.city import freeze, tile_jobs
 from flows.ingest import ingest_root
-from flows.plan import plan_city, space_key
+from flows.plan import plan_city, record_plan, space_key
 from flows.publication import Built, publish
 from flows.reconcile import hold_city, reconcile
 from presight_core.config import load_city_settings
@@ -74,6 +74,7 @@ class ToyCity:
         reconcile(workspace, CITY)
         with hold_city(workspace, CITY, wait) as lease:
             plan = plan_city(workspace, CITY, settings)
+            record_plan(workspace, plan)
             if plan.is_current:
                 return plan.generation
             if plan.stale:
