@@ -3,11 +3,13 @@
 Planning reads and never writes, but for `record_plan`; it imports neither torch nor Prefect.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flows.drives import CityDrives, choose_drives, require_split_apart
 from flows.staleness import Reason, stale_reasons
@@ -98,7 +100,7 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
         raise _no_drives(workspace, city, known)
     require_split_apart(city, workspace.drives(), known, settings.split)
     frames = city_frames(workspace.drives(), known.builders, settings) if known.builders else None
-    city_tiling = _tiling(catalog.tiling(city), city, frames, generation, settings)
+    city_tiling = _tiling(workspace, city, frames, generation, settings)
     space_id = workspace.artifacts().pinned_space(space_key(settings))
     features = features_recipe(settings, space_id) if space_id else None
     past = {build.tile_id: build for build in catalog.builds(city, "published")}
@@ -212,15 +214,29 @@ def features_recipe(settings: CitySettings, space_id: str) -> Recipe:
 
 
 def _tiling(
-    frozen: Tiling | None, city: str, frames: FrameTable | None, generation: Generation | None, settings: CitySettings
+    workspace: Workspace, city: str, frames: FrameTable | None, generation: Generation | None, settings: CitySettings
 ) -> Tiling:
     """The city's frozen tiling, with new tiles founded on new ground; the first one if there is none."""
+    frozen = workspace.catalog().tiling(city)
     if frames is None:
         assert generation is not None
         return frozen or Tiling.from_json(generation.tiling)
     if frozen is None:
         return tiling.cut_city(city, frames.positions, settings.tiling)
-    return tiling.extend_tiling(frozen, frames.positions, settings.tiling)
+    known = () if settings.tiling.tile_count is None else _cut_from(workspace, city)
+    return tiling.extend_tiling(frozen, frames.positions, settings.tiling, known)
+
+
+def _cut_from(workspace: Workspace, city: str) -> NDArray[np.float64]:
+    """Camera positions (N, 3) of the drives that were there when the city's tiling was cut, world metres."""
+    catalog, index = workspace.catalog(), workspace.drives()
+    cut_at = catalog.tiling_created_at(city) or ""
+    positions = [np.empty((0, 3))]
+    for record in catalog.drive_records(city):
+        if record.added_at <= cut_at:
+            with suppress(NotFoundError):  # a removed drive whose index was cleared
+                positions.append(index.frames(record.drive.drive_id).positions)
+    return np.concatenate(positions)
 
 
 def _recipes(

@@ -6,6 +6,7 @@ a vehicle stood at one place, and not on the number of threads.
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
 
 from presight_core.config import TilingSettings
 from presight_core.errors import InputError
@@ -37,17 +38,23 @@ def cut_city(city: str, positions_world: ArrayLike, settings: TilingSettings) ->
     return Tiling(tiling_id, city, tiles)
 
 
-def extend_tiling(tiling: Tiling, positions_world: ArrayLike, settings: TilingSettings) -> Tiling:
+def extend_tiling(
+    tiling: Tiling, positions_world: ArrayLike, settings: TilingSettings, cut_from_world: ArrayLike = ()
+) -> Tiling:
     """The tiling with new tiles on ground out of reach of every tile; existing tiles and the id stay.
 
-    Positions the tiling was cut from are all in reach, so they never found a tile. A fixed
-    `settings.tile_count` is kept: then nothing is founded.
+    Positions the tiling was cut from are all in reach, unless a fixed `settings.tile_count` made its tiles larger:
+    then they must be given, and ground within view of them founds nothing. New tiles are of the usual area.
     """
     places = _places(_checked(positions_world, f"city {tiling.city}"))
     far = places[_distance_m(places, tiling.centroids) > _reach_m(settings)]
-    if settings.tile_count is not None or len(far) == 0:
+    known = np.asarray(cut_from_world, np.float64).reshape(-1, 3)
+    if len(known) and len(far):
+        far = far[KDTree(_places(known)).query(far)[0] > VIEW_RANGE_M]
+    if len(far) == 0:
         return tiling
-    founded = _numbered(_tile_centroids(far, settings), first=len(tiling.tiles))
+    usual = settings.model_copy(update={"tile_count": None})
+    founded = _numbered(_tile_centroids(far, usual), first=len(tiling.tiles))
     return Tiling(tiling.tiling_id, tiling.city, tiling.tiles + founded)
 
 

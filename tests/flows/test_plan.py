@@ -99,3 +99,16 @@ def test_the_cost_comes_from_past_builds_and_goes_with_the_rays(city):
 def test_without_a_past_build_the_time_is_unknown(city):
     plan = plan_of(city, "training.steps=2400")
     assert "time unknown" in cost_line(plan, forecast(city.workspace, plan))
+
+
+def test_a_drive_on_new_ground_founds_a_tile_and_moves_none(city):
+    before = plan_of(city).tiling.tiles
+    remote = TinyDataset(city.root / "remote", VERSION)
+    for row in remote.tables["ego_pose"]:
+        row["translation"][0] += 20_000
+    ingest_root(city.root, remote.write(), VERSION, keep_going=False, as_json=False)
+    plan = plan_of(city)
+    assert plan.tiling.tiles[:2] == before
+    assert [(tile.tile_id, tile.reasons) for tile in plan.stale] == [("t002", ("never built",))]
+    assert city.build() == 2
+    assert plan_of(city).is_current

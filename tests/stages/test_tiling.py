@@ -81,9 +81,15 @@ def test_extending_founds_tiles_on_far_ground_and_keeps_the_old_ones(town):
     assert extend_tiling(extended, everything, TilingSettings()) is extended
 
 
-def test_a_fixed_tile_count_is_never_extended(town):
-    tiling = cut_city("town", town, FOUR_TILES)
-    assert extend_tiling(tiling, town + np.array([10_000, 0, 0]), FOUR_TILES) is tiling
+def test_a_fixed_tile_count_founds_tiles_on_new_ground_only(town):
+    one = TilingSettings(tile_count=1, tile_area_km2=0.01)  # the town lies far out of reach of its one tile
+    tiling = cut_city("town", town, one)
+    assert extend_tiling(tiling, town, one, town) is tiling
+    everything = np.concatenate([town, town + np.array([10_000, 0, 0])])
+    extended = extend_tiling(tiling, everything, one, town)
+    assert extended.tiles[:1] == tiling.tiles
+    assert min(tile.centroid_m[0] for tile in extended.tiles[1:]) > 9_000
+    assert extend_tiling(extended, everything, one, town) is extended
 
 
 def test_k_means_finds_separate_clumps():
