@@ -192,7 +192,7 @@ def test_batched_windows_of_a_remote_store_are_fetched_together(town, monkeypatc
     )
     reader = town.reader()
     windows = reader.windows(list(POSES.values()), **RANGES)
-    assert [size for size in batches if size] == [1, 1, 1, 6]  # three block tables, then all voxel arrays at once
+    assert [size for size in batches if size] == [1, 1, 1, 2, 4]  # three block tables, then places, then looks
     monkeypatch.undo()
     for window, pose in zip(windows, POSES.values(), strict=True):
         np.testing.assert_array_equal(window.hits, town.reader().window(pose, **RANGES).hits)
