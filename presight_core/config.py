@@ -75,7 +75,7 @@ class FieldSettings(Settings):
     hidden_width: Count = 64
     proposal_width: Count = 64  # hidden units of the proposal networks (paper: 64 everywhere)
     geometry_channels: Count = 15
-    video_embedding: Count = 12
+    video_embedding: Annotated[int, Field(ge=0)] = 12
     image_embedding: Annotated[int, Field(ge=0)] = 4
     density_bias: float = -4.0  # metres; the released code, whose poses are scaled by 0.05, needs none
 
@@ -163,6 +163,7 @@ class WorkspaceSettings(Settings):
     catalog: str | None = None  # SQLAlchemy URL
     store: str | None = None  # folder or object-store URL of the prior store
     caches: str | None = None  # folder for frames, features and training scratch
+    lease_s: Annotated[float, Field(ge=1)] = 60.0  # a build that is silent for so long is taken for dead
 
 
 SettingsType = TypeVar("SettingsType", bound=Settings)

@@ -135,6 +135,17 @@ def video_numbers(frames: FrameTable) -> NDArray[np.int64]:
     return np.unique(frames.drive_id, return_inverse=True)[1].astype(np.int64)
 
 
+def image_numbers(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.int64]:
+    """The number of each trained frame in the field's embedding, -1 of the others.
+
+    Frames that are not trained on have none: their random rows would spoil the mean that evaluation uses.
+    """
+    numbers = np.full(len(frames), -1, np.int64)
+    rows = training_rows(frames, settings)
+    numbers[rows] = np.arange(len(rows))
+    return numbers
+
+
 def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """The rows in use, and which of them are held out."""
     rows = np.flatnonzero(frames.is_keyframe) if settings.keyframes_only else np.arange(len(frames))
@@ -183,8 +194,8 @@ class Run:
         self.step, self.metrics = 0, {}
         self._job, self._settings = job, job.settings.training
         self._file = scratch / "training.safetensors"
-        self._videos = video_numbers(job.frames)
-        self.field = _new_field(job, int(self._videos.max()) + 1)
+        self._videos, self._images = video_numbers(job.frames), image_numbers(job.frames, self._settings)
+        self.field = _new_field(job, int(self._videos.max()) + 1, int(self._images.max()) + 1)
         self._names = {id(parameter): name for name, parameter in self.field.named_parameters()}
         is_table = {id(parameter): name.endswith("grid.table") for name, parameter in self.field.named_parameters()}
         tables = [parameter for parameter in self.field.parameters() if is_table[id(parameter)]]
@@ -238,7 +249,8 @@ class Run:
             self._optimiser.state[parameter] = {quantity: values[name] for quantity, values in state.items()}
 
     def _rays(self, batch: PixelBatch) -> Rays:
-        return self.field.rays(batch.origins_world, batch.directions_world, self._videos[batch.rows], batch.rows)
+        videos, images = self._videos[batch.rows], self._images[batch.rows]
+        return self.field.rays(batch.origins_world, batch.directions_world, videos, images)
 
     def _losses(self, rendering: Rendering, batch: PixelBatch, trains_proposals: bool) -> dict[str, Tensor]:
         """The five losses (paper, section 3.2), weighted."""
@@ -258,12 +270,11 @@ class Run:
         return parts
 
 
-def _new_field(job: TileTraining, video_count: int) -> TileField:
+def _new_field(job: TileTraining, video_count: int, image_count: int) -> TileField:
     """A field with random parameters that depend on the seed alone."""
     settings = job.settings
-    shape = FieldShape(
-        job.sub_fields, settings.field, settings.sampling, job.feature_channels, video_count, len(job.frames)
-    )
+    counts = (job.feature_channels, video_count, image_count)
+    shape = FieldShape(job.sub_fields, settings.field, settings.sampling, *counts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.training.seed)
         field = TileField(shape).to(job.device)

@@ -12,6 +12,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, ObjectStore
 
 from presight_core.errors import StoreError
+from presight_core.failpoints import failpoint
 from presight_core.priors.location import local_folder
 
 
@@ -28,10 +29,12 @@ def open_store(location: str | Path) -> ObjectStore:
 def put_once(store: ObjectStore, path: str, content: bytes) -> bool:
     """Create an object, or leave the one that is there: False. At most one of many writers sees True."""
     with storing(path):
+        failpoint("store-before-put")
         try:
             obstore.put(store, path, content, mode="create")
         except AlreadyExistsError:
             return False
+        failpoint("store-after-put")
         return True
 
 

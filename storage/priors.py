@@ -84,29 +84,62 @@ class PriorStore:
         tiles: Mapping[str, GenerationTile],
         parent: int | None,
         tiling: Mapping[str, Any] | None = None,
+        fence: int | None = None,
     ) -> int:
         """Publish builds as one new generation; its number.
 
         `parent` is the generation that the builds were planned on (None: the city had none), and the new
         one keeps its other tiles. If others published meanwhile, their tiles are kept too. `tiling`
         (`Tiling.to_json`) is needed for the first generation; tiles that a new tiling has not, or has
-        elsewhere, are no longer shown.
+        elsewhere, are no longer shown. `fence` is the fencing number of the publisher's lease, if it has one.
 
-        Raises ConflictError if somebody else published one of the same tiles or another tiling meanwhile,
+        Raises ConflictError if somebody else published one of the same tiles or another tiling meanwhile, or
+        was given a greater fencing number,
         StoreError if a build is not whole, NotFoundError if `parent` is not there.
         """
         facts = self.city(city)
         self._check_builds(facts, tiles)
         for _ in range(MOST_ATTEMPTS):
             head = self.generation(city)
+            _check_fence(city, head, fence)
             self._check_meanwhile(city, tiles, parent, head, tiling)
-            generation = replace(_next(facts, head, tiles, tiling), parent_sha256=self._sha256(head))
-            content = encode(generation.to_json())
-            path = generation_path(city, generation.number)
-            # A put whose answer was lost may have landed: then what is there is our own document.
-            if put_once(self._objects, path, content) or self._source.read(path) == content:
+            generation = replace(_next(facts, head, tiles, tiling), fence=max(fence or 0, head.fence if head else 0))
+            if self._commit(generation):
                 return generation.number
         raise ConflictError(f"{city}: {MOST_ATTEMPTS} other generations came first; run it again")
+
+    def raise_fence(self, city: str, fence: int) -> None:
+        """Shut out every publisher with a smaller fencing number, also one that is about to put its generation.
+
+        That takes a generation of its own, equal to the one before: it has the number that theirs would have
+        had. A city that the store does not know has no such publisher. Raises ConflictError for a greater fence.
+        """
+        if not exists(self._objects, city_path(city)):
+            return
+        facts = self.city(city)
+        for _ in range(MOST_ATTEMPTS):
+            head = self.generation(city)
+            _check_fence(city, head, fence)
+            if head and head.fence == fence:
+                return
+            empty = {"tiling_id": "none", "city": city, "tiles": []}  # nothing is published yet
+            if self._commit(replace(_next(facts, head, {}, head.tiling if head else empty), fence=fence)):
+                return
+        raise ConflictError(f"{city}: {MOST_ATTEMPTS} other generations came first; run it again")
+
+    def fence(self, city: str) -> int:
+        """The greatest fencing number that published in the city; 0 if none did."""
+        head = self.generation(city)
+        return head.fence if head else 0
+
+    def _commit(self, generation: Generation) -> bool:
+        """Put the generation, chained to its parent's bytes, if its number is free; False if somebody else has it."""
+        path, parent = generation_path(generation.city, generation.number), generation.parent
+        before = self._source.read(generation_path(generation.city, parent)) if parent else None
+        parent_sha256 = None if before is None else hashlib.sha256(before).hexdigest()
+        content = encode(replace(generation, parent_sha256=parent_sha256).to_json())
+        # A put whose answer was lost may have landed: then what is there is our own document.
+        return put_once(self._objects, path, content) or self._source.read(path) == content
 
     def generation(self, city: str, number: int | None = None) -> Generation | None:
         """A generation; for None the newest, or None if nothing is published. Raises NotFoundError for others."""
@@ -144,11 +177,9 @@ class PriorStore:
         StoreError if a build of it is gone.
         """
         old, head = read_generation(self._source, city, number), read_generation(self._source, city, None)
-        new = replace(
-            old, number=head.number + 1, parent=head.number, parent_sha256=self._sha256(head), restores=number
-        )
+        new = replace(old, number=head.number + 1, parent=head.number, restores=number, fence=head.fence)
         self._check_builds(self.city(city), old.tiles)
-        if not put_once(self._objects, generation_path(city, new.number), encode(new.to_json())):
+        if not self._commit(new):
             raise ConflictError(f"{city}: generation {new.number} came first; look at it, then run it again")
         return new.number
 
@@ -179,13 +210,6 @@ class PriorStore:
         if content is None:
             raise NotFoundError(f"{self.location} has no {path}; save it first")
         return decode(content, f"{self.location}/{path}", _without_version)
-
-    def _sha256(self, generation: Generation | None) -> str | None:
-        """The digest of a generation's file, which the next one carries."""
-        if generation is None:
-            return None
-        content = self._source.read(generation_path(generation.city, generation.number))
-        return hashlib.sha256(content or b"").hexdigest()
 
     def _check_builds(self, facts: CityDocument, tiles: Mapping[str, GenerationTile]) -> None:
         for tile_id, tile in tiles.items():
@@ -220,6 +244,14 @@ class PriorStore:
             )
         if base and tiling and base.tiling != head.tiling != tiling:
             raise ConflictError(f"{city}: generation {head.number} brought another tiling; plan and build again")
+
+
+def _check_fence(city: str, head: Generation | None, fence: int | None) -> None:
+    if head and fence is not None and head.fence > fence:
+        raise ConflictError(
+            f"{city}: generation {head.number} has fencing number {head.fence}, this run {fence}: it was taken for "
+            "dead and may no longer publish; run `presight build` again"
+        )
 
 
 def _next(

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 
 from presight_core.priors.documents import checked_name, generation_path
@@ -60,8 +61,7 @@ def _garbage(location: str | Path, city: str, retention: Retention, now: datetim
     tags = [name.removesuffix(".json") for name in source.names(f"{city}/tags")]
     kept = set(numbers[-max(1, retention.keep) :]) | {read_tag(source, city, tag) for tag in tags}
     # A generation is old when the one that replaced it is.
-    pairs = zip(numbers, numbers[1:], strict=False)
-    kept |= {number for number, following in pairs if written[generation_path(city, following)] > oldest}
+    kept |= {number for number, following in pairwise(numbers) if written[generation_path(city, following)] > oldest}
     shown = [read_generation(source, city, number) for number in numbers if number in kept]
     needed = {f"{city}/{tile.entry.path}" for generation in shown for tile in generation.tiles.values()}
     builds: dict[str, list[StoredObject]] = {}

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from obstore.store import ObjectStore
 
 from presight_core.errors import ConflictError
+from presight_core.failpoints import failpoint
 from presight_core.grid import morton
 from presight_core.priors.chunks import array_document, chunk_checksum, chunk_path, encode_chunk
 from presight_core.priors.documents import VERSION, CityDocument, TileEntry, lattice_to_json, tile_path
@@ -153,6 +154,7 @@ class _ArrayWriter:
         self.digest.update(np.ascontiguousarray(rows).astype(rows.dtype.newbyteorder("<"), copy=False).data)
         self.row_count += len(rows)
         size = self.spec.chunk_rows
+        failpoint("slab-before-write")
         pieces = [rows[first : first + size] for first in range(0, len(rows), size)]
         numbers = range(len(self.checksums), len(self.checksums) + len(pieces))
         self.checksums += self.pool.map(self._write_chunk, pieces, numbers)

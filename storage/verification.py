@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ class _Verifier:
                 self._fault(generation_path(self.city, number - 1), f"is not the one that generation {number} followed")
         tagged = self._tagged(generations)
         present = generation_numbers(self.source, self.city)
-        for number, following in zip(present, present[1:], strict=False):
+        for number, following in pairwise(present):
             if following > number + 1 and number not in tagged:
                 self._fault(generation_path(self.city, number + 1), "is missing")
 

@@ -123,7 +123,7 @@ class DensityNetwork(nn.Module):
 
     def forward(self, positions: Tensor, assignment: Assignment) -> Tensor:
         """Outputs (N, outputs) at positions (N, 3) of the grids, sorted by sub-field."""
-        return self.network(self.grid(positions, assignment.segments), assignment.bounds)
+        return self.network(self.grid(positions, assignment.segments), assignment)
 
 
 class TileField(nn.Module):
@@ -246,8 +246,8 @@ class TileField(nn.Module):
         )
         of_rays = conditions.to(density.dtype).repeat_interleave(sample_count, 0)
         seen = torch.cat([geometry_values, assignment.sort(of_rays)], -1)
-        rgb = torch.sigmoid(self.colour(seen, assignment.bounds).float())
-        features = self.semantics(torch.relu(hidden), assignment.bounds)
+        rgb = torch.sigmoid(self.colour(seen, assignment).float())
+        features = self.semantics(torch.relu(hidden), assignment)
         shape = ray_count, sample_count
         return PointValues(
             assignment.restore(self._activate(density[:, 0], inside)).view(shape),
@@ -293,8 +293,8 @@ class TileField(nn.Module):
         """Colour (R, 3) and features (R, C) of the sky; the features ignore the video."""
         assignment = assign(rays.origins, self.centroids)
         seen = assignment.sort(conditions[:, : HARMONICS + self.shape.settings.video_embedding])
-        rgb = torch.sigmoid(self.sky_colour(seen, assignment.bounds).float())
-        features = self.sky_features(seen[:, :HARMONICS], assignment.bounds).float()
+        rgb = torch.sigmoid(self.sky_colour(seen, assignment).float())
+        features = self.sky_features(seen[:, :HARMONICS], assignment).float()
         return assignment.restore(rgb), assignment.restore(features)
 
     def _jitter(self, rays: Rays, sampling: Sampling) -> Tensor | None:

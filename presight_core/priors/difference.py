@@ -51,5 +51,5 @@ def _voxels(table: TileTable | None) -> NDArray[np.int64]:
 
 def _keys(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
     """One number for each voxel."""
-    x, y, z = (voxels + [OFFSET, OFFSET, 1 << (HEIGHT_BITS - 1)]).T
+    x, y, z = (voxels + np.array([OFFSET, OFFSET, 1 << (HEIGHT_BITS - 1)])).T
     return (x << COLUMN_BITS | y) << HEIGHT_BITS | z

@@ -145,6 +145,7 @@ class Generation:
     space_id: str
     tiling: dict[str, Any]  # `Tiling.to_json` of the registry that the tiles belong to
     tiles: dict[str, GenerationTile]  # by tile id
+    fence: int = 0  # greatest fencing number of any publisher so far; who holds a smaller one is refused
     parent_sha256: str | None = None  # of the parent's file
     restores: int | None = None  # the earlier generation that this one equals, for a rollback
 
@@ -158,6 +159,7 @@ class Generation:
             "restores": self.restores,
             "city": self.city,
             "space_id": self.space_id,
+            "fence": self.fence,
             "tiling": self.tiling,
             "tiles": {tile_id: tile.to_json() for tile_id, tile in sorted(self.tiles.items())},
         }
@@ -175,6 +177,7 @@ class Generation:
             tiles=tiles,
             parent_sha256=value["parent_sha256"],
             restores=value["restores"],
+            fence=int(value["fence"]),
         )
 
 

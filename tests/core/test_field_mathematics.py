@@ -3,7 +3,7 @@ import torch
 
 from presight_core.config import TrainingSettings
 from presight_core.field import losses, rendering, samplers, schedule
-from presight_core.field.assignment import assign
+from presight_core.field.assignment import Assignment, assign
 from presight_core.field.contraction import contract, grid_position
 from presight_core.field.mlp import SubFieldMlp
 from presight_core.field.spherical_harmonics import spherical_harmonics
@@ -183,7 +183,7 @@ def test_restoring_passes_gradients_to_the_right_rows():
 def test_each_sub_field_has_its_own_network():
     network = SubFieldMlp(2, (3, 4, 2))
     inputs = torch.ones(5, 3)
-    outputs = network(inputs, [0, 2, 5])
+    outputs = network(inputs, Assignment(torch.tensor([0, 2, 5])))
     assert torch.equal(outputs[0], outputs[1])
     assert torch.equal(outputs[2], outputs[4])
     assert not torch.equal(outputs[0], outputs[2])

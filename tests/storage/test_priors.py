@@ -286,3 +286,57 @@ def test_a_store_can_be_a_file_url(tmp_path: Path):
 def test_a_location_that_cannot_be_written_is_a_store_error(location: str):
     with pytest.raises(StoreError, match=location):
         PriorStore.open(location)
+
+
+def test_a_publisher_with_an_older_fencing_number_is_refused_and_changes_nothing(town):
+    store = town.store
+    store.publish("town", {"t001": town.write("t001", "build-1")}, 1, fence=7)
+    with pytest.raises(ConflictError, match="fencing number 7, this run 6"):
+        store.publish("town", {"t002": town.write("t002", "build-1")}, 1, fence=6)
+    assert store.generations("town") == [1, 2]
+    assert store.fence("town") == 7
+
+
+def test_the_fence_outlives_publishers_that_have_none(town):
+    town.store.raise_fence("town", 5)
+    town.store.publish("town", {"t001": town.write("t001", "build-1")}, 1)
+    assert town.store.fence("town") == 5
+
+
+def test_raising_the_fence_shows_the_same_tiles_and_is_done_once(town):
+    town.store.raise_fence("town", 5)
+    town.store.raise_fence("town", 5)
+    first, second = (town.store.generation("town", number) for number in (1, 2))
+    assert town.store.generations("town") == [1, 2]
+    assert second == replace(first, number=2, parent=1, fence=5, parent_sha256=second.parent_sha256)
+    with pytest.raises(ConflictError, match="may no longer publish"):
+        town.store.raise_fence("town", 4)
+
+
+def test_a_publisher_that_is_about_to_put_when_the_fence_rises_is_refused(town, monkeypatch):
+    """It has read generation 1 and made number 2 of it; somebody raises the fence; then it goes on."""
+    tile = town.write("t001", "build-1")
+    commit = PriorStore._commit
+
+    def late(store, generation):
+        monkeypatch.setattr(PriorStore, "_commit", commit)
+        town.store.raise_fence("town", 2)
+        return commit(store, generation)
+
+    monkeypatch.setattr(PriorStore, "_commit", late)
+    with pytest.raises(ConflictError, match="taken for dead"):
+        town.store.publish("town", {"t001": tile}, 1, fence=1)
+    final = town.store.generation("town")
+    assert final is not None
+    assert (final.number, sorted(final.tiles)) == (2, ["t000"])
+
+
+def test_a_city_without_generations_can_be_fenced_and_then_published(empty_town):
+    store = empty_town.store
+    store.raise_fence("unknown-city", 3)  # nothing to fence
+    store.raise_fence("town", 3)
+    tile = empty_town.write("t000", "build-1")
+    with pytest.raises(ConflictError):
+        store.publish("town", {"t000": tile}, None, empty_town.tiling, fence=2)
+    assert store.publish("town", {"t000": tile}, None, empty_town.tiling, fence=3) == 2
+    assert len(empty_town.reader().tiles) == 1
