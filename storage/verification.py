@@ -8,13 +8,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from presight_core.errors import PresightError
+from presight_core.errors import PresightError, StoreError
 from presight_core.priors.chunks import array_document, chunk_path, decode_chunk
 from presight_core.priors.documents import (
     CityDocument,
     Generation,
     GenerationTile,
     checked_name,
+    city_path,
     generation_path,
     lattice_to_json,
 )
@@ -61,7 +62,11 @@ class _Verifier:
         self.sizes = {entry.path: entry.size for entry in objects(open_store(location), self.city)}
 
     def run(self) -> Verification:
-        facts = read_city(self.source, self.city)
+        try:
+            facts = read_city(self.source, self.city)
+        except StoreError as error:
+            self._fault(city_path(self.city), str(error))
+            return self.result
         generations = self._generations(facts)
         self._history(generations)
         builds = {tile.entry.path: tile for generation in generations.values() for tile in generation.tiles.values()}
