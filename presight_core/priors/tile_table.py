@@ -127,9 +127,9 @@ class TileTable:
         chunks = self.load([(name, piece.chunk) for name in names for piece in wanted[name]])
         return {name: self._gather(name, len(rows), wanted[name], chunks) for name in names}
 
-    def points(self) -> NDArray[np.float64]:
-        """World points (N, 3) of every voxel, metres."""
-        return self._points([(0, int(self.block_start[-1]))])
+    def points(self, first: int = 0, last: int | None = None) -> NDArray[np.float64]:
+        """World points (N, 3), metres, of the rows from first to last, which is all of them if not given."""
+        return self._points([(first, int(self.block_start[-1]) if last is None else last)])
 
     def rows(self, name: str, rows: NDArray[np.int64]) -> NDArray:
         """The given ascending rows of one array."""
