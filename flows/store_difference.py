@@ -6,7 +6,7 @@ import numpy as np
 
 from flows.console import print_json, print_table
 from presight_core.grid import Lattice
-from presight_core.maps import MapView, birds_eye
+from presight_core.maps import FOOTPRINT, MapView, birds_eye
 from presight_core.pictures import Rgb, save_png, stack_rows
 from presight_core.priors.difference import TileDifference, tile_difference
 from presight_core.priors.reader import PriorReader
@@ -63,4 +63,4 @@ def difference_picture(tiles: list[TileDifference], lattice: Lattice) -> Rgb:
     pixel_m = max(lattice.voxel_m / 2, (right - left) / WIDEST_PX, (top - bottom) / WIDEST_PX)
     view = MapView((left, right), (bottom, top), pixel_m)
     title = "grey: the same, orange: changed, red: removed, blue: added"
-    return stack_rows([[birds_eye(points, np.concatenate(colours), view, lattice.voxel_m)]], [title])
+    return stack_rows([[birds_eye(points, np.concatenate(colours), view, FOOTPRINT * lattice.voxel_m)]], [title])

@@ -33,7 +33,7 @@ def tile_difference(old: TileTable | None, new: TileTable | None) -> TileDiffere
     if old is not None and new is not None:
         for name in COMPARED:
             unequal = old.all_rows(name)[there] != new.all_rows(name)[here]
-            differs |= unequal.reshape(len(unequal), -1).any(-1)
+            differs |= unequal.any(tuple(range(1, unequal.ndim)))
     return TileDifference(
         added=np.delete(after, here, axis=0),
         removed=np.delete(before, there, axis=0),
