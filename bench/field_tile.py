@@ -59,7 +59,7 @@ def train(tile: BenchTile, marks: list[int]) -> Iterator[tuple[int, float, TileF
         for step in range(settings.steps):
             pool, groups = pools.at(step)
             random = np.random.default_rng([settings.seed, step])
-            run.train(step, draw_static(pool, settings.batch_rays, groups, random, dynamic))
+            run.train(step, draw_static(pool, settings.batch_rays, groups, random, dynamic, settings.thin_weight))
             if step + 1 in marks or step + 1 == settings.steps:
                 spent += time.process_time() - started
                 yield step + 1, spent / 60, run.field

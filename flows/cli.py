@@ -8,7 +8,7 @@ import typer
 
 from flows import store_commands
 from flows.options import AsJson, City
-from presight_core.errors import MissingDependencyError, PresightError
+from presight_core.errors import MissingDependencyError, PresightError, StoreError
 
 app = typer.Typer(
     help="Turn the camera logs of past drives into a city's neural prior.",
@@ -17,6 +17,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+catalog_commands = typer.Typer(help="Look after the catalog.", no_args_is_help=True)
+app.add_typer(catalog_commands, name="catalog")
 
 Overrides = Annotated[
     list[str] | None,
@@ -86,6 +89,14 @@ def build(
     from flows.build import build_city
 
     build_city(context.obj, city, override or [], parallel, as_json, wait)
+
+
+@catalog_commands.command("rebuild")
+def rebuild_catalog(context: typer.Context, as_json: AsJson = False) -> None:
+    """Make a lost catalog again, from the store and the index of drives."""
+    from flows.reconcile import rebuild
+
+    rebuild(context.obj, as_json)
 
 
 @app.command()
@@ -187,6 +198,8 @@ def main() -> None:
         app()
     except PresightError as error:
         _fail(error)
+    except OSError as error:
+        _fail(StoreError(f"{error}; check the disk's space and your access to it, then run again"))
     except ModuleNotFoundError as error:
         cure = "this command needs the whole pipeline: pip install '.[pipeline]' (README, Install)"
         _fail(MissingDependencyError(f"{error}; {cure}"))

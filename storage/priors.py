@@ -123,7 +123,8 @@ class PriorStore:
             if head and head.fence == fence:
                 return
             empty = {"tiling_id": "none", "city": city, "tiles": []}  # nothing is published yet
-            if self._commit(replace(_next(facts, head, {}, head.tiling if head else empty), fence=fence)):
+            following = _next(facts, head, {}, head.tiling if head else empty)
+            if self._commit(replace(following, fence=fence)):
                 return
         raise ConflictError(f"{city}: {MOST_ATTEMPTS} other generations came first; run it again")
 
@@ -202,6 +203,11 @@ class PriorStore:
         path, content = _document_path(city, kind, name), encode({**value, "format_version": VERSION})
         if not put_once(self._objects, path, content) and self._source.read(path) != content:
             raise ConflictError(f"{self.location}/{path} is there with other content; use another name")
+
+    def documents(self, city: str, kind: str) -> list[str]:
+        """Names of the documents of a kind that `save_document` kept, sorted."""
+        names = self._source.names(f"{checked_name(city)}/{checked_name(kind)}")
+        return [name.removesuffix(".json") for name in names if name.endswith(".json")]
 
     def document(self, city: str, kind: str, name: str) -> dict[str, Any]:
         """A document that `save_document` kept. Raises NotFoundError if it is not there."""

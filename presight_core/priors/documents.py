@@ -145,9 +145,9 @@ class Generation:
     space_id: str
     tiling: dict[str, Any]  # `Tiling.to_json` of the registry that the tiles belong to
     tiles: dict[str, GenerationTile]  # by tile id
-    fence: int = 0  # greatest fencing number of any publisher so far; who holds a smaller one is refused
     parent_sha256: str | None = None  # of the parent's file
     restores: int | None = None  # the earlier generation that this one equals, for a rollback
+    fence: int = 0  # greatest fencing number of any publisher so far; who holds a smaller one is refused
 
     def to_json(self) -> dict[str, Any]:
         """The generation as JSON values."""
@@ -177,7 +177,7 @@ class Generation:
             tiles=tiles,
             parent_sha256=value["parent_sha256"],
             restores=value["restores"],
-            fence=int(value["fence"]),
+            fence=value.get("fence", 0),
         )
 
 

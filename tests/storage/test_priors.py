@@ -303,6 +303,12 @@ def test_the_fence_outlives_publishers_that_have_none(town):
     assert town.store.fence("town") == 5
 
 
+def test_the_fence_outlives_a_rollback(town):
+    town.store.raise_fence("town", 5)
+    town.store.rollback("town", 1)
+    assert town.store.fence("town") == 5
+
+
 def test_raising_the_fence_shows_the_same_tiles_and_is_done_once(town):
     town.store.raise_fence("town", 5)
     town.store.raise_fence("town", 5)
