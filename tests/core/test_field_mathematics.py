@@ -120,7 +120,7 @@ def test_the_ground_loss_is_the_missing_weight_beyond_the_start_of_the_ground():
     weights = torch.tensor([[0.25, 0.5, 0.0], [0.0, 0.0, 0.0]])
     middles_m = torch.tensor([[1.0, 2.0, 3.0]]).expand(2, 3)
     loss = losses.ground_loss(weights, middles_m, torch.tensor([1.5, 0.0]))
-    assert loss.item() == pytest.approx(-math.log(0.5) / 2)  # the second ray knows of no ground
+    assert loss.item() == pytest.approx(-math.log((0.5 + 0.1) / 1.1) / 2)  # the second ray knows of no ground
 
 
 def test_distortion_equals_the_sum_over_all_pairs():
