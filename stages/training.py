@@ -16,7 +16,8 @@ from presight_core.config import CitySettings, TrainingSettings
 from presight_core.drives import FrameTable
 from presight_core.errors import BuildError, InputError, NotFoundError
 from presight_core.field import checkpoint, losses, schedule, threads
-from presight_core.field.tile_field import FieldShape, Rays, Rendering, Sampling, TileField
+from presight_core.field.rays import Rays
+from presight_core.field.tile_field import FieldShape, Rendering, Sampling, TileField
 from presight_core.pixels import PixelSource
 from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import Recipe

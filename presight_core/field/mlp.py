@@ -33,15 +33,17 @@ class SubFieldMlp(nn.Module):
             self.biases.append(torch.empty(sub_field_count, outputs).uniform_(-bound, bound))
 
     def forward(
-        self, inputs: Float[Tensor, "points inputs"], assignment: Assignment
+        self, inputs: Float[Tensor, "points inputs"], assignment: Assignment, outputs: int | None = None
     ) -> Float[Tensor, "points outputs"]:
-        """Outputs of each row, from the sub-field that it is assigned to."""
+        """The first `outputs`, or all, of each row, from the sub-field that it is assigned to."""
         if self._is_fused(inputs):
             from presight_core.field.triton_mlp import SubFieldLayers  # slow to import, and only there with a card
 
             layers = [layer for pair in zip(self.weights, self.biases, strict=True) for layer in pair]
-            return SubFieldLayers.apply(inputs, assignment.segments, self.dtype, *layers)  # type: ignore[return-value]
-        parameters = (*self.weights, *self.biases)
+            result: Tensor = SubFieldLayers.apply(inputs, assignment.segments, self.dtype, *layers)  # type: ignore[assignment]
+            return result[:, :outputs]
+        last = slice(outputs)
+        parameters = (*self.weights[:-1], self.weights[-1][:, last], *self.biases[:-1], self.biases[-1][:, last])
         return _BlockwiseLayers.apply(inputs, assignment.bounds, self.dtype, torch.is_grad_enabled(), *parameters)  # type: ignore[return-value]
 
     def _is_fused(self, inputs: Tensor) -> bool:
