@@ -31,6 +31,7 @@ class ModelCard(Settings):
     input: str  # name of the (N, 3, H, W) float32 input
     input_height_px: Count  # images are resized to this size
     input_width_px: Count
+    resample: Literal["area", "bilinear", "bicubic"] = "area"  # by OpenCV's averages, or as Pillow and transformers do
     mean: Channels  # of RGB scaled to 0..1
     std: Channels
     output: str

@@ -37,19 +37,29 @@ class Network:
 
     def run(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """The network's output (N, rows, columns, channels) for RGB images of any size."""
-        parts = [self._run_batch(images[i : i + self.batch_size]) for i in range(0, len(images), self.batch_size)]
-        return np.concatenate(parts)
+        return self.infer(self.prepare(images))
 
-    def _run_batch(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        output: Any = self._session.run([self.card.output], {self.card.input: prepare(images, self.card)})[0]
-        expected = (len(images), *_output_shape(self.card))
+    def prepare(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+        """The network's input (N, 3, H, W) for RGB images of any size."""
+        return prepare(images, self.card)
+
+    def infer(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The network's output (N, rows, columns, channels) for its input."""
+        parts = [self._infer_batch(values[i : i + self.batch_size]) for i in range(0, len(values), self.batch_size)]
+        return np.concatenate(
+            [np.zeros((0, self.card.rows, self.card.columns, self.card.channels), np.float32), *parts]
+        )
+
+    def _infer_batch(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        output: Any = self._session.run([self.card.output], {self.card.input: values})[0]
+        expected = (len(values), *_output_shape(self.card))
         if output.shape != expected:
             raise InputError(f"{self.card.file}: output {output.shape}, the card says {expected}; correct the card")
         if not np.isfinite(output).all():
             raise InputError(f"{self.card.file}: the output holds NaN or infinity; export the model in float32")
         if self.card.layout == "NCHW":
             return output.transpose(0, 2, 3, 1)
-        return output.reshape(len(images), self.card.rows, self.card.columns, self.card.channels)
+        return output.reshape(len(values), self.card.rows, self.card.columns, self.card.channels)
 
 
 class FeatureExtractor:
@@ -68,25 +78,35 @@ class FeatureExtractor:
 
     def labels(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """Label maps (N, rows, columns) of Cityscapes train ids, at the network's output resolution."""
-        return self._segmentation.run(images).argmax(-1).astype(np.uint8)
+        return self.segmentation.run(images).argmax(-1).astype(np.uint8)
 
     def raw_features(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """Features (N, rows, columns, D) as the network gives them, not yet in the shared feature space."""
-        return self._features.run(images)
+        return self.features.run(images)
 
     @property
     def batch_size(self) -> int:
         """How many images make a good batch."""
-        return self._features.batch_size
+        return self.features.batch_size
+
+    @property
+    def least_px(self) -> tuple[int, int]:
+        """Width and height that an image should keep when it is decoded; (0, 0) where every pixel counts."""
+        cards = [card for card in (self.segmentation_card, self.feature_card) if card is not None]
+        if any(card.resample != "area" for card in cards):
+            return 0, 0
+        return max(card.input_width_px for card in cards), max(card.input_height_px for card in cards)
 
     @cached_property
-    def _segmentation(self) -> Network:
+    def segmentation(self) -> Network:
+        """The segmentation network. Raises InputError if there is none."""
         if self.segmentation_card is None:
             raise InputError("there is no segmentation model; set features.masks to auto or model")
         return Network(self.segmentation_card, self.threads)
 
     @cached_property
-    def _features(self) -> Network:
+    def features(self) -> Network:
+        """The feature network."""
         return Network(self.feature_card, self.threads)
 
 
@@ -97,8 +117,19 @@ def prepare(images: Sequence[NDArray[np.uint8]], card: ModelCard) -> NDArray[np.
     scale = (1 / (255 * np.array(card.std))).astype(np.float32)
     shift = (np.array(card.mean) / np.array(card.std)).astype(np.float32)
     for image, place in zip(images, batch, strict=True):
-        place[:] = (resized(image, width, height) * scale - shift).transpose(2, 0, 1)
+        place[:] = (_resized(image, card) * scale - shift).transpose(2, 0, 1)
     return batch
+
+
+def _resized(image: NDArray[np.uint8], card: ModelCard) -> NDArray[np.uint8]:
+    """The image at the network's input size, by the method that the network was trained with."""
+    height, width = _input_size(card)
+    if card.resample == "area":
+        return resized(image, width, height)
+    from PIL import Image
+
+    method = Image.Resampling[card.resample.upper()]  # as transformers does it: with a filter as wide as it shrinks
+    return np.asarray(Image.fromarray(image).resize((width, height), method))
 
 
 def refuse_external_data(content: bytes, card: ModelCard) -> None:
