@@ -6,6 +6,8 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from flows.feature_commands import features
+from flows.model_commands import models
 from presight_core.errors import MissingDependencyError, PresightError
 
 app = typer.Typer(
@@ -15,6 +17,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+app.add_typer(features, name="features")
+app.add_typer(models, name="models")
 
 City = Annotated[
     str, typer.Argument(help="City: the log location, for example singapore-onenorth.", show_default=False)

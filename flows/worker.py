@@ -98,12 +98,12 @@ def fit_space(job: Job) -> dict[str, Any]:
     """The feature space of the job's drives, frozen: of two fits at once, the first one counts."""
     from flows.plan import drive_frames, space_key
     from stages.features import FeatureExtractor
-    from stages.space_fitting import fit_space, space_images
+    from stages.space_fitting import SpaceImages, fit_space
 
     workspace, settings = job.opened_workspace, job.opened_settings
     drives = [drive for drive in workspace.catalog().drives(job.city) if drive.drive_id in job.drive_ids]
     index = workspace.drives()
-    images = space_images((drive, drive_frames(index, drive.drive_id, settings)) for drive in drives)
+    images = SpaceImages((drive, drive_frames(index, drive.drive_id, settings)) for drive in drives)
     space = fit_space(images, FeatureExtractor.load(settings.features, job.threads), settings.features, say)
     artifacts = workspace.artifacts()
     return {"space_id": artifacts.pin_space(space_key(settings), artifacts.save_space(space))}

@@ -21,11 +21,7 @@ SHADOW_DARKNESS = 0.7  # of the median brightness of the ground around: the sun'
 
 def recipe(settings: "FeatureSettings") -> dict[str, Any]:
     """What decides the masked pixels besides the classes, as JSON values."""
-    return {
-        "margin": settings.dynamic_margin,
-        "shadows": settings.mask_shadows,
-        "parked_cars": settings.parked_cars,
-    }
+    return {"margin": settings.dynamic_margin, "shadows": settings.mask_shadows}
 
 
 def masked_labels(

@@ -13,6 +13,9 @@ from presight_core.images import resized
 from presight_core.model_card import ModelCard
 
 BATCH_PIXELS = 1 << 20  # input pixels a batch: 11 images of the tiny models, one of DINO; activations stay small
+STANDARD_DOMAINS = ("", "ai.onnx")
+REFUSED_OPERATORS = {"Loop", "Scan", "RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike"}
+REFUSED_OPERATORS |= {"Bernoulli", "Multinomial"}
 ERRORS_ONLY = 3  # ONNX Runtime's log level; its warnings are about graph optimisation
 
 
@@ -22,12 +25,12 @@ class Network:
     def __init__(self, card: ModelCard, threads: int = 1):
         """Verify the model of `card` and open it on the GPU where ONNX Runtime has one, else on `threads` cores.
 
-        Raises InputError if the file is not the card's, keeps data in other files, or takes or gives other
-        arrays than the card says.
+        Raises InputError if the file is not the card's, keeps data in files that the card does not list, uses
+        operators that it may not, or takes or gives other arrays than the card says.
         """
         self.card = card
         content = card.read_model()
-        refuse_external_data(content, card)
+        refuse_what_no_hash_covers(content, card)
         self._session = _session(content, card, threads)
         _check_shape(card, "input", card.input, self._session.get_inputs(), (1, 3, *_input_size(card)))
         _check_shape(card, "output", card.output, self._session.get_outputs(), (1, *_output_shape(card)))
@@ -132,8 +135,12 @@ def _resized(image: NDArray[np.uint8], card: ModelCard) -> NDArray[np.uint8]:
     return np.asarray(Image.fromarray(image).resize((width, height), method))
 
 
-def refuse_external_data(content: bytes, card: ModelCard) -> None:
-    """Raise InputError if an ONNX model is unreadable, or would read weights from other files: no hash covers those."""
+def refuse_what_no_hash_covers(content: bytes, card: ModelCard) -> None:
+    """Raise InputError if an ONNX model is unreadable, or if more than the card's files would decide its output.
+
+    Such are weights in files that the card does not list, operators of other domains (code of their own), loops (no
+    bound on time) and random numbers (the cache holds what a recipe gives, once and for all).
+    """
     import onnx
     from google.protobuf.message import DecodeError
 
@@ -141,25 +148,30 @@ def refuse_external_data(content: bytes, card: ModelCard) -> None:
         model = onnx.load_model_from_string(content)
     except DecodeError as error:
         raise InputError(f"{card.file}: not an ONNX model ({error}); export it again") from error
-    for tensor in _tensors(model):
-        if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
+    for tensor in _messages(model, "TensorProto"):
+        external = {entry.key: entry.value for entry in tensor.external_data}
+        is_external = tensor.data_location == onnx.TensorProto.EXTERNAL or external
+        if is_external and external.get("location") not in card.external_data:
             raise InputError(
-                f"{card.file}: tensor {tensor.name!r} is kept in another file; save the model as one file "
-                "(onnx.save(..., save_as_external_data=False))"
+                f"{card.file}: tensor {tensor.name!r} is kept in another file, which the card's external_data does not "
+                "list; save the model as one file (onnx.save(..., save_as_external_data=False))"
             )
+    for node in _messages(model, "NodeProto"):
+        if node.domain not in STANDARD_DOMAINS or node.op_type in REFUSED_OPERATORS:
+            name = f"{node.domain}.{node.op_type}".removeprefix(".")
+            raise InputError(f"{card.file}: operator {name} is refused; export the model with standard operators")
 
 
-def _tensors(message: Any) -> Iterator[Any]:
-    """Every TensorProto inside a protobuf message: weights, constants, sub-graphs, functions."""
+def _messages(message: Any, name: str) -> Iterator[Any]:
+    """Every message of a name inside a protobuf message: in sub-graphs, constants and functions, too."""
     from google.protobuf.message import Message
 
-    if message.DESCRIPTOR.name == "TensorProto":
+    if message.DESCRIPTOR.name == name:
         yield message
-        return
     for field, value in message.ListFields():
         if field.message_type is not None:
             for child in [value] if isinstance(value, Message) else value:
-                yield from _tensors(child)
+                yield from _messages(child, name)
 
 
 def _session(content: bytes, card: ModelCard, threads: int) -> Any:
@@ -173,7 +185,8 @@ def _session(content: bytes, card: ModelCard, threads: int) -> Any:
     wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
     providers = [provider for provider in wanted if provider in onnxruntime.get_available_providers()]
     try:
-        return onnxruntime.InferenceSession(content, options, providers=providers)
+        model = str(card.file) if card.external_data else content  # other files are found beside a path only
+        return onnxruntime.InferenceSession(model, options, providers=providers)
     except Exception as error:  # ONNX Runtime's errors have no common base but this
         raise InputError(f"{card.file}: ONNX Runtime refuses the model ({error}); export it again") from error
 

@@ -22,13 +22,21 @@ DEAD_RANGE = 1e-6  # of the widest channel: a narrower one is rounding noise, an
 CHUNK_PATCHES = 1 << 14  # patches in float64 at a time: 100 MB for 768 channels
 
 
-def space_images(drives: Iterable[tuple[Drive, FrameTable]]) -> Iterator[NDArray[np.uint8]]:
+class SpaceImages:
     """The images that the feature space is fitted on: the first keyframe of up to three cameras of every drive.
 
-    Drives go in the order of their ids. An image that cannot be read is passed over.
+    Drives go in the order of their ids. An image that cannot be read is passed over. Images are read one by one.
     """
-    for drive, frames in sorted(drives, key=lambda pair: pair[0].drive_id):
-        for row in _space_rows(frames):
+
+    def __init__(self, drives: Iterable[tuple[Drive, FrameTable]]):
+        ordered = sorted(drives, key=lambda pair: pair[0].drive_id)
+        self._chosen = [(drive, frames, row) for drive, frames in ordered for row in _space_rows(frames)]
+
+    def __length_hint__(self) -> int:
+        return len(self._chosen)
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        for drive, frames, row in self._chosen:
             try:
                 yield read_image(drive, frames, row)
             except ImageError:

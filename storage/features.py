@@ -94,6 +94,10 @@ class FeatureCache:
         """The layers of one row. Raises InputError if its image was rejected, StoreError if the cache is damaged."""
         return self._drive(key, drive_id).read(row)
 
+    def read_labels(self, key: str, drive_id: str, row: int) -> NDArray[np.uint8]:
+        """The label map of one row; raises as `read`."""
+        return self._drive(key, drive_id).read_labels(row)
+
     def rows_of(self, key: str, drive_id: str) -> dict[str, int]:
         """The row of every image path of the drive."""
         return self._drive(key, drive_id).rows
@@ -286,11 +290,18 @@ class _DriveLayers:
 
     def read(self, row: int) -> FrameLayers:
         """The layers of one row."""
+        return FrameLayers(self.read_labels(row), self._chunk("features", row))
+
+    def read_labels(self, row: int) -> NDArray[np.uint8]:
+        """The label map of one row."""
         if row in self.rejects:
             reject = self.rejects[row]
             raise InputError(f"{reject.file}: {reject.detail}; {reject.cure}")
+        return self._chunk(self.label_arrays[row], row)
+
+    def _chunk(self, name: str, row: int) -> NDArray[np.uint8]:
         try:
-            return FrameLayers(self.arrays[self.label_arrays[row]][row], self.arrays["features"][row])
+            return self.arrays[name][row]
         except (ValueError, RuntimeError, OSError) as error:  # a wrong checksum, a frame zstd refuses, a bad disk
             raise _damaged(self.path, f"row {row} cannot be read ({error})") from error
 

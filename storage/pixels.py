@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from presight_core.config import CitySettings
 from presight_core.drives import FrameTable
@@ -33,13 +34,24 @@ class CachedPixels(PixelSource):
 
         Raises InputError if the image cannot be read or was rejected by the feature stage.
         """
-        frames, drive_id = self._frames, str(self._frames.drive_id[row])
+        drive_id = str(self._frames.drive_id[row])
         layers = self._cache.read(self._key, drive_id, int(self._cache_rows[row]))
-        width, height = int(frames.width_px[row]), int(frames.height_px[row])
-        rgb = read_rgb(self._roots[drive_id] / str(frames.path[row]), width, height)
-        scale = self._settings.training.image_scale
-        rgb = resized(rgb, max(1, round(width * scale)), max(1, round(height * scale)))
+        rgb = self._load_rgb(row)
         return FramePixels(rgb, masked_labels(layers.labels, rgb, self._settings.features), layers.features)
+
+    def load_labels(self, row: int) -> NDArray[np.uint8]:
+        """The labels of `load` alone, at a fraction of its cost where masks need no image."""
+        labels = self._cache.read_labels(self._key, str(self._frames.drive_id[row]), int(self._cache_rows[row]))
+        needs_image = self._settings.features.mask_shadows
+        rgb = self._load_rgb(row) if needs_image else np.zeros((1, 1, 3), np.uint8)
+        return masked_labels(labels, rgb, self._settings.features)
+
+    def _load_rgb(self, row: int) -> NDArray[np.uint8]:
+        frames = self._frames
+        width, height = int(frames.width_px[row]), int(frames.height_px[row])
+        rgb = read_rgb(self._roots[str(frames.drive_id[row])] / str(frames.path[row]), width, height)
+        scale = self._settings.training.image_scale
+        return resized(rgb, max(1, round(width * scale)), max(1, round(height * scale)))
 
 
 def _cache_rows(frames: FrameTable, cache: FeatureCache, key: str) -> np.ndarray:

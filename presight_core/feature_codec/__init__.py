@@ -1,9 +1,10 @@
 """The compact code of a feature map: at most 60 kB an image at the paper's grid of 72 x 128 x 64.
 
 As image codecs do it: blocks of 8 x 8 patches of a channel go through the cosine transform, the coefficients are
-divided by a step and rounded, and what remains is entropy-coded with contexts. The step is the finest one whose code
-stays below the limit. Channels that explain more of the model's variance have finer steps, but only somewhat: a field
-is trained on the scaled features, where all channels count alike. docs/decisions/010 argues and measures the choice.
+divided by a step and rounded, and what remains is entropy-coded with contexts. The step is FINEST_STEP, or larger
+where the code would not stay below the limit. Channels that explain more of the model's variance have finer steps,
+but only somewhat: a field is trained on the scaled features, where all channels count alike. docs/decisions/010
+argues and measures the choice.
 
     header   version, rows, columns, channels, step of each channel (float16), mean of each channel (uint8)
     body     the range coder's bytes
@@ -20,8 +21,8 @@ from presight_core.feature_codec.range_coder import BLOCK
 VERSION = 1
 HEADER = struct.Struct("<BHHH")
 PAPER_VALUES = 72 * 128 * 64
-BITS_PER_VALUE = 8 * 57_000 / PAPER_VALUES  # 60 kB an image at the paper's grid, less 3 kB for its label map
-FINEST_STEP = 12.0  # of 255: an error of about 4 levels, a twelfth of a channel's deviation; finer shows nowhere
+LARGEST_BYTES = 57_000  # at the paper's grid and below: 60 kB an image, less 3 kB for its label map
+FINEST_STEP = 32.0  # of 255: the error is then a fifth of a channel's deviation, the centred cosine 0.98
 WEIGHT_EXPONENT = 0.25  # of a channel's range: where both kinds of error are small (docs/decisions/010)
 LEAST_BYTES = 64  # of a body, however small the grid
 ROUNDING = 0.38  # instead of 0.5: a small coefficient costs more bits than it mends error
@@ -35,14 +36,18 @@ def channel_weights(ranges: ArrayLike) -> NDArray[np.float32]:
     return np.exp(WEIGHT_EXPONENT * (logarithm - logarithm.mean())).astype(np.float32)
 
 
-def encode(features: NDArray[np.uint8], weights: ArrayLike, bits_per_value: float = BITS_PER_VALUE) -> bytes:
-    """The compact code of features (rows, columns, C), of at most `bits_per_value` bits a value."""
+def encode(features: NDArray[np.uint8], weights: ArrayLike, limit_bytes: int | None = None) -> bytes:
+    """The compact code of features (rows, columns, C), of at most `limit_bytes`.
+
+    If not given, these are 57 kB, and as many more as the grid is larger than the paper's.
+    """
     rows, columns, channels = features.shape
     weights = np.asarray(weights, np.float32)
     means = np.round(features.mean((0, 1))).astype(np.uint8)
     coefficients = _transformed(features - means.astype(np.float32)) * weights[:, None, None, None, None]
     header = HEADER.pack(VERSION, rows, columns, channels)
-    limit = max(LEAST_BYTES, int(features.size * bits_per_value / 8) - len(header) - 3 * channels)
+    limit_bytes = limit_bytes or round(LARGEST_BYTES * max(1.0, features.size / PAPER_VALUES))
+    limit = max(LEAST_BYTES, limit_bytes - len(header) - 3 * channels)
     step = max(FINEST_STEP, _first_step(coefficients, limit))
     while True:
         steps = (step / weights).astype(np.float16)

@@ -16,7 +16,7 @@ from presight_core.pixels import FrameLayers
 from presight_core.progress import Progress
 from stages.features import FeatureExtractor, extract_drive
 from stages.networks import Network
-from stages.space_fitting import fit_space, space_images
+from stages.space_fitting import SpaceImages, fit_space
 
 WIDTH_PX, HEIGHT_PX = 96, 64
 SETTINGS = FeatureSettings(channels=4)
@@ -57,7 +57,7 @@ def drive(tmp_path) -> tuple[Drive, FrameTable]:
 
 @pytest.fixture
 def space(drive, extractor):
-    return fit_space(space_images([drive]), extractor, SETTINGS)
+    return fit_space(SpaceImages([drive]), extractor, SETTINGS)
 
 
 def write_mask(drive, row: int, labels: np.ndarray) -> None:
@@ -160,7 +160,7 @@ def test_a_space_of_another_model_is_refused(drive, extractor, space):
 
 
 def test_the_space_is_fitted_on_one_keyframe_of_each_camera(drive):
-    images = list(space_images([drive]))
+    images = list(SpaceImages([drive]))
     root = Path(drive[0].root)
     expected = [cv2.imread(str(root / path)) for path in ("sweeps/CAM_BACK/0.jpg", "sweeps/CAM_FRONT/1.jpg")]
     assert len(images) == 2
@@ -170,17 +170,17 @@ def test_the_space_is_fitted_on_one_keyframe_of_each_camera(drive):
 
 def test_no_more_than_three_cameras_of_a_drive_are_used(drive):
     cameras = np.array([f"CAM_{i}" for i in range(7)])
-    assert len(list(space_images([(drive[0], replace(drive[1], camera=cameras))]))) == 3
+    assert len(list(SpaceImages([(drive[0], replace(drive[1], camera=cameras))]))) == 3
 
 
 def test_the_space_has_the_wanted_channels_or_the_models(drive, extractor):
-    images = list(space_images([drive]))
+    images = list(SpaceImages([drive]))
     assert fit_space(images, extractor, FeatureSettings(channels=3)).channel_count == 3
     assert fit_space(images, extractor, FeatureSettings(channels=64)).channel_count == 8
 
 
 def test_the_same_images_give_the_same_space(drive, extractor, space):
-    assert fit_space(space_images([drive]), extractor, SETTINGS).space_id == space.space_id
+    assert fit_space(SpaceImages([drive]), extractor, SETTINGS).space_id == space.space_id
 
 
 def test_directions_are_orthonormal_sorted_by_variance_and_signed(space):
@@ -191,7 +191,7 @@ def test_directions_are_orthonormal_sorted_by_variance_and_signed(space):
 
 
 def test_the_space_equals_a_plain_decomposition_of_all_patches(drive, extractor):
-    images = list(space_images([drive]))
+    images = list(SpaceImages([drive]))
     space = fit_space(images, extractor, SETTINGS)
     raw = extractor.raw_features(images).reshape(-1, 8).astype(np.float64)
     values, vectors = np.linalg.eigh(np.cov(raw.T, bias=True))
@@ -203,7 +203,7 @@ def test_the_space_equals_a_plain_decomposition_of_all_patches(drive, extractor)
 
 
 def test_the_directions_do_not_depend_on_the_sample_and_its_ranges_hardly(drive, extractor, space):
-    small = fit_space(space_images([drive]), extractor, FeatureSettings(channels=4, sample_patches=50))
+    small = fit_space(SpaceImages([drive]), extractor, FeatureSettings(channels=4, sample_patches=50))
     np.testing.assert_array_equal(small.components, space.components)
     assert 0 < np.abs(small.high - space.high).max() < 0.5 * (space.high - space.low).max()
 
