@@ -131,8 +131,9 @@ def features_recipe(settings: CitySettings, space_id: str) -> Recipe:
         "feature_model": ModelCard.load(settings.features.feature_model, "features").identity,
         "space": space_id,
     }
-    chosen: dict[str, Any] = {"masks": settings.features.masks, "keyframes_only": settings.training.keyframes_only}
-    chosen["cache"] = settings.features.cache
+    features = settings.features
+    chosen = {"masks": features.masks, "cache": features.cache, "parked_cars": features.parked_cars}
+    chosen |= {"keyframes_only": settings.training.keyframes_only}
     return Recipe("features", versions.FEATURES, chosen, models)
 
 

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from presight_core import classes
 from presight_core.config import FeatureSettings
 from presight_core.drives import Drive, FrameTable, Reject
 from presight_core.errors import InputError
@@ -18,6 +19,7 @@ from presight_core.pixels import FrameLayers
 from presight_core.progress import Progress, Report, silent
 from stages.networks import FeatureExtractor
 from stages.pipeline import Pipeline, Step
+from stages.standing import Shot, standing_vehicles
 
 __all__ = ["FeatureExtractor", "Item", "extract_drive", "read_image"]
 
@@ -45,7 +47,7 @@ def extract_drive(  # noqa: PLR0913, PLR0917 - the last two have defaults
             f"the feature model is {extractor.feature_card.sha256[:12]}; use that model, or fit a new space"
         )
     rows = np.arange(len(frames)) if rows is None else rows
-    return _Extraction(drive, frames, space, extractor, settings.masks).run(rows, report)
+    return _Extraction(drive, frames, space, extractor, settings).run(rows, report)
 
 
 def read_image(drive: Drive, frames: FrameTable, row: int, least_px: tuple[int, int] = (0, 0)) -> NDArray[np.uint8]:
@@ -64,6 +66,7 @@ class _Loaded:
     row: int
     rgb: NDArray[np.uint8]
     labels: NDArray[np.uint8] | None
+    neighbour: Shot | None  # the image before or after it, where standing vehicles are wanted
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class _Extraction:
     frames: FrameTable
     space: FeatureSpace
     extractor: FeatureExtractor
-    masks: str
+    settings: FeatureSettings
 
     def run(self, rows: NDArray[np.int64], report: Report) -> Iterator[Item]:
         size = self.extractor.batch_size
@@ -112,17 +115,32 @@ class _Extraction:
     def _load(self, row: int) -> _Loaded | tuple[int, Reject]:
         try:
             rgb = read_image(self.drive, self.frames, row, self.extractor.least_px)
-            return _Loaded(row, rgb, self._precomputed_labels(row))
+            return _Loaded(row, rgb, self._precomputed_labels(row), self._neighbour(row))
         except ImageError as error:
             return row, error.reject(self.drive.name)
 
     def _precomputed_labels(self, row: int) -> NDArray[np.uint8] | None:
-        if self.masks == "model":
+        if self.settings.masks == "model":
             return None
         file = Path(self.drive.root) / mask_path(str(self.frames.path[row]))
-        if self.masks == "auto" and not file.is_file():
+        if self.settings.masks == "auto" and not file.is_file():
             return None
         return read_labels(file)
+
+    def _neighbour(self, row: int) -> Shot | None:
+        """The frame before this one of its camera, or else the one after it, or else nothing."""
+        if self.settings.parked_cars == "drop":
+            return None
+        for other in (row - 1, row + 1):
+            if 0 <= other < len(self.frames) and self.frames.camera[other] == self.frames.camera[row]:
+                try:
+                    return self._shot(other, read_image(self.drive, self.frames, other, self.extractor.least_px))
+                except ImageError:
+                    continue
+        return None
+
+    def _shot(self, row: int, rgb: NDArray[np.uint8]) -> Shot:
+        return Shot(rgb, self.frames.camera_of(row).scaled(rgb.shape[1], rgb.shape[0]))
 
     def _prepare(self, items: list[_Loaded | tuple[int, Reject]]) -> _Batch:
         loaded = [item for item in items if isinstance(item, _Loaded)]
@@ -142,7 +160,14 @@ class _Extraction:
         labels = iter(() if batch.label_values is None else batch.label_values.argmax(-1).astype(np.uint8))
         features = self.space.encode(batch.feature_values)
         done: list[Item] = [
-            (item.row, FrameLayers(next(labels) if item.labels is None else item.labels, values))
+            (item.row, FrameLayers(self._kept(item, next(labels) if item.labels is None else item.labels), values))
             for item, values in zip(batch.loaded, features, strict=True)
         ]
         return sorted([*done, *batch.refused], key=lambda item: item[0])
+
+    def _kept(self, item: _Loaded, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The labels, with vehicles that stand still unknown: like all that is not masked, they are then mapped."""
+        if item.neighbour is None:
+            return labels
+        standing = standing_vehicles(labels, self._shot(item.row, item.rgb), item.neighbour)
+        return np.where(standing, np.uint8(classes.UNKNOWN), labels)

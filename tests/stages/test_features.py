@@ -238,3 +238,22 @@ def test_every_step_tells_how_busy_it_was(drive, extractor, space):
 def test_pictures_show_the_three_strongest_directions(space):
     features = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
     np.testing.assert_array_equal(space.picture(features), features[..., :3])
+
+
+def test_parked_cars_are_kept_where_the_setting_says_so(drive, extractor, space, monkeypatch):
+    mask = np.full((32, 48), 13, np.uint8)
+    write_mask(drive, 3, mask)
+    seen = []
+
+    def everything_stands(labels, now, other):
+        seen.append((now.rgb.shape, other.camera.width_px))
+        return labels == 13
+
+    monkeypatch.setattr("stages.features.standing_vehicles", everything_stands)
+    keep = SETTINGS.model_copy(update={"parked_cars": "keep"})
+    assert (layers_of(extract_drive(*drive, space, extractor, keep), 3).labels == 255).all()
+    assert seen[3] == (
+        (HEIGHT_PX // 2, WIDTH_PX // 2, 3),
+        WIDTH_PX // 2,
+    )  # decoded at half size, and its camera with it
+    np.testing.assert_array_equal(layers_of(extract_drive(*drive, space, extractor, SETTINGS), 3).labels, mask)
