@@ -22,6 +22,7 @@ from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import Recipe
 from presight_core.tiles import SubField
 from stages import versions
+from stages.card_pool import Targets
 from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
 
 REPORT_SECONDS = 0.5
@@ -199,14 +200,35 @@ class Run:
         """One step of the optimiser; its losses by name."""
         for group in self._optimiser.param_groups:
             group["lr"] = schedule.learning_rate(step, self._settings)
+        jitter = self._random(step, len(batch.rows), self.passes)
+        exponent, trains_proposals = self._schedule(step)
+        targets = Targets(
+            *(torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.labels, batch.features))
+        )
+        return self._descend(self._rays(batch), targets, Sampling(jitter, exponent, trains_proposals))
+
+    @property
+    def passes(self) -> int:
+        """How often samples are placed along a ray."""
+        return len(self._job.settings.sampling.proposal_samples) + 1
+
+    def _random(self, step: int, *size: int) -> Tensor:
+        """Uniform random numbers of a step."""
         # Torch's seed must depend on both: consecutive seeds of the same run never meet those of another.
         self._generator.manual_seed(self._settings.seed << 32 | step)
-        trains_proposals = schedule.trains_proposals(step, self._settings)
-        sampling = Sampling(self._generator, schedule.anneal_exponent(step, self._settings), trains_proposals)
-        parts = self._losses(self.field(self._rays(batch), sampling), batch, trains_proposals)
+        return torch.rand(*size, generator=self._generator, device=self._job.device)
+
+    def _schedule(self, step: int) -> tuple[float, bool]:
+        """The exponent of the proposals' weights, and whether the proposals learn."""
+        return schedule.anneal_exponent(step, self._settings), schedule.trains_proposals(step, self._settings)
+
+    def _descend(self, rays: Rays, targets: Targets, sampling: Sampling) -> dict[str, Tensor]:
+        """One step of the optimiser; its losses by name. On a card nothing here may wait for it: see CardRun."""
+        parts = self._losses(self.field(rays, sampling), targets, sampling.train_proposals)
         torch.stack(list(parts.values())).sum().backward()
         self._optimiser.step()
         self._optimiser.zero_grad()
+        self.field.refresh_copies()
         return {name: part.detach() for name, part in parts.items()}
 
     def save(self, step: int, figures: dict[str, float]) -> None:
@@ -240,17 +262,14 @@ class Run:
     def _rays(self, batch: PixelBatch) -> Rays:
         return self.field.rays(batch.origins_world, batch.directions_world, self._videos[batch.rows], batch.rows)
 
-    def _losses(self, rendering: Rendering, batch: PixelBatch, trains_proposals: bool) -> dict[str, Tensor]:
+    def _losses(self, rendering: Rendering, targets: Targets, trains_proposals: bool) -> dict[str, Tensor]:
         """The five losses (paper, section 3.2), weighted."""
-        weights = self._settings.loss
-        rgb, features, labels = (
-            torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.features, batch.labels)
-        )
-        known = labels != classes.UNKNOWN
+        weights, labels = self._settings.loss, targets.labels
+        sky = losses.sky_loss(rendering.accumulation, labels == classes.SKY, labels != classes.UNKNOWN)
         parts = {
-            "rgb": functional.mse_loss(rendering.rgb, rgb / 255),
-            "features": weights.features * losses.feature_loss(rendering.features, features / 255),
-            "sky": weights.sky * losses.sky_loss(rendering.accumulation[known], labels[known] == classes.SKY),
+            "rgb": functional.mse_loss(rendering.rgb, targets.rgb / 255),
+            "features": weights.features * losses.feature_loss(rendering.features, targets.features / 255),
+            "sky": weights.sky * sky,
             "distortion": weights.distortion * losses.distortion_loss(rendering.field.edges, rendering.field.weights),
         }
         if trains_proposals:
