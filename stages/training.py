@@ -2,6 +2,8 @@
 
 import hashlib
 import time
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +31,9 @@ REPORT_SECONDS = 0.5
 POOL_BYTES = 3 << 30  # of decoded images in memory
 POOL_STEPS = 250  # a pool that cannot hold all images is drawn anew this often (released code: about 280)
 PULSE_WIDTHS = (0.03, 0.003)  # of the blurred interlevel loss, coarse proposal first (released code)
+
+
+Advance = Callable[[int], dict[str, Tensor]]  # does a step; its losses by name
 
 
 @dataclass(frozen=True)
@@ -80,24 +85,39 @@ def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Re
     rows = training_rows(job.frames, job.settings.training)
     if not len(rows):
         raise InputError(f"tile {job.tile_id}: none of its {len(job.frames)} frames is for training; ingest more")
-    run = Run(job, scratch)
+    run, advance = _start(job, source, rows, scratch)
     if run.step < job.settings.training.steps:
         report(Progress("training", run.step, job.settings.training.steps))
-        pools = _Pools(job, source, rows)
-        with _Log(job, scratch, report) as log:
-            _train(job, run, pools, log)
+        with closing(run), _Log(job, scratch, report) as log:
+            _train(job, run, advance, log)
     checkpoint.save_field(scratch / "field", run.field)
     return TrainingResult(scratch / "field", run.metrics)
 
 
-def _train(job: TileTraining, run: "Run", pools: "_Pools", log: "_Log") -> None:
-    """All steps that are left."""
-    settings, dynamic = job.settings.training, job.settings.features.dynamic_classes
-    for step in range(run.step, settings.steps):
+def _start(job: TileTraining, source: PixelSource, rows: NDArray[np.int64], scratch: Path) -> tuple["Run", Advance]:
+    """A run, and what takes it one step further: with a card by itself, else with rays drawn from pools."""
+    from stages import card_training
+
+    if card_training.suits(job):
+        on_card = card_training.CardRun(job, scratch, source, rows)
+        return on_card, on_card.advance
+    run, settings = Run(job, scratch), job.settings
+    pools = _Pools(job, source, rows)
+
+    def advance(step: int) -> dict[str, Tensor]:
         pool, groups = pools.at(step)
-        random = np.random.default_rng([settings.seed, step])
-        batch = draw_static(pool, settings.batch_rays, groups, random, dynamic)
-        log.add(step, run.train(step, batch))
+        random = np.random.default_rng([settings.training.seed, step])
+        batch = draw_static(pool, settings.training.batch_rays, groups, random, settings.features.dynamic_classes)
+        return run.train(step, batch)
+
+    return run, advance
+
+
+def _train(job: TileTraining, run: "Run", advance: Advance, log: "_Log") -> None:
+    """All steps that are left."""
+    settings = job.settings.training
+    for step in range(run.step, settings.steps):
+        log.add(step, advance(step))
         if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
             log.flush(step)
             run.save(step + 1, log.figures)
@@ -230,6 +250,9 @@ class Run:
         self._optimiser.zero_grad()
         self.field.refresh_copies()
         return {name: part.detach() for name, part in parts.items()}
+
+    def close(self) -> None:
+        """Let go of what works in the background."""
 
     def save(self, step: int, figures: dict[str, float]) -> None:
         """Make the state after `step` steps durable."""

@@ -27,7 +27,7 @@ TOLERANCES = {
 
 @pytest.fixture(scope="module")
 def errors() -> dict[str, float]:
-    return interpreted("hash")
+    return interpreted("tests.core.triton_interpreted", "hash")
 
 
 @pytest.mark.parametrize("case", TOLERANCES)

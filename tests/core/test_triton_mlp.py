@@ -12,7 +12,7 @@ PAPER = {"proposal": (8, 64, 1), "trunk": (40, 64, 80), "colour": (47, 64, 64, 3
 
 
 def test_networks_agree_with_a_loop_of_linear_layers_under_the_interpreter():
-    errors = interpreted("mlp")
+    errors = interpreted("tests.core.triton_interpreted", "mlp")
     assert len(errors) == 8
     for case, error in errors.items():
         # float16 has 11 bits, and a hidden value near zero may be rounded to either side of it.

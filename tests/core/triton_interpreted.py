@@ -5,6 +5,7 @@
 
 import json
 import sys
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -98,7 +99,7 @@ def mlp_cases() -> dict[str, float]:
     return errors
 
 
-PARTS = {"hash": hash_cases, "mlp": mlp_cases}
+PARTS: dict[str, Callable[[], dict[str, float]]] = {"hash": hash_cases, "mlp": mlp_cases}
 
 if __name__ == "__main__":
     torch.manual_seed(0)
