@@ -77,7 +77,7 @@ def _network_error(bench: Bench, widths: tuple[int, ...]) -> float:
     inputs, segments = bench.points(2**16 if bench.is_paper else 200)
     inputs = torch.randn(len(inputs), widths[0], device=bench.device, requires_grad=True)
     wanted = (inputs, *network.parameters())
-    expected = network._one_by_one(inputs, segments.tolist())
+    expected = network.blockwise(inputs, segments.tolist())
     upstream = torch.randn_like(expected)
     plain = (expected, *torch.autograd.grad(expected, wanted, upstream))
     network.dtype = bench.dtype

@@ -79,12 +79,27 @@ def build(
     parallel: Annotated[
         int | None, typer.Option(min=1, help="Tiles at once; as many as GPUs, or else cores, if not given.")
     ] = None,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait while another run builds the city, rather than refuse.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Build and publish what is stale of a city: features, training, extraction, validation."""
     from flows.build import build_city
 
-    build_city(context.obj, city, override or [], parallel, as_json)
+    build_city(context.obj, city, override or [], parallel, as_json, wait)
+
+
+@app.command()
+def reconcile(
+    context: typer.Context,
+    city: Annotated[str | None, typer.Argument(help="City; all cities if not given.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find runs that died, and end what they left as running in the catalog."""
+    from flows.reconcile import show_reconciled
+
+    show_reconciled(context.obj, city, as_json)
 
 
 @app.command()

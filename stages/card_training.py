@@ -88,7 +88,7 @@ class CardRun(Run):
             world_from_pixel=world_from_pixel.astype(np.float32),
             sizes_px=np.stack([frames.width_px, frames.height_px], -1).astype(np.int64),
             videos=self._videos[rows],
-            images=rows,
+            images=self._images[rows],
             sub_fields=distances.argmin(-1),
         )
 

@@ -4,7 +4,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from presight_core.recipes import Recipe
 from presight_core.tiles import SubField
 from stages import versions
 from stages.card_pool import Targets
+from stages.ground import Ground
 from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
 
 REPORT_SECONDS = 0.5
@@ -107,8 +108,8 @@ def _start(job: TileTraining, source: PixelSource, rows: NDArray[np.int64], scra
     def advance(step: int) -> dict[str, Tensor]:
         pool, groups = pools.at(step)
         random = np.random.default_rng([settings.training.seed, step])
-        batch = draw_static(pool, settings.training.batch_rays, groups, random, settings.features.dynamic_classes)
-        return run.train(step, batch)
+        dynamic, thin_weight = settings.features.dynamic_classes, settings.training.thin_weight
+        return run.train(step, draw_static(pool, settings.training.batch_rays, groups, random, dynamic, thin_weight))
 
     return run, advance
 
@@ -154,6 +155,17 @@ def holdout_mask(frames: FrameTable, every: int) -> NDArray[np.bool_]:
 def video_numbers(frames: FrameTable) -> NDArray[np.int64]:
     """The number of each frame's video (drive) in the field's embedding."""
     return np.unique(frames.drive_id, return_inverse=True)[1].astype(np.int64)
+
+
+def image_numbers(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.int64]:
+    """The number of each trained frame in the field's embedding, -1 of the others.
+
+    Frames that are not trained on have none: their random rows would spoil the mean that evaluation uses.
+    """
+    numbers = np.full(len(frames), -1, np.int64)
+    rows = training_rows(frames, settings)
+    numbers[rows] = np.arange(len(rows))
+    return numbers
 
 
 def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -204,8 +216,8 @@ class Run:
         self.step, self.metrics = 0, {}
         self._job, self._settings = job, job.settings.training
         self._file = scratch / "training.safetensors"
-        self._videos = video_numbers(job.frames)
-        self.field = _new_field(job, int(self._videos.max()) + 1)
+        self._videos, self._images = video_numbers(job.frames), image_numbers(job.frames, self._settings)
+        self.field = _new_field(job, int(self._videos.max()) + 1, int(self._images.max()) + 1)
         self._names = {id(parameter): name for name, parameter in self.field.named_parameters()}
         is_table = {id(parameter): name.endswith("grid.table") for name, parameter in self.field.named_parameters()}
         tables = [parameter for parameter in self.field.parameters() if is_table[id(parameter)]]
@@ -214,6 +226,8 @@ class Run:
         # 1e-15 (Instant-NGP): a hash row's gradients are tiny and rare, the usual 1e-8 would swallow them.
         self._optimiser = torch.optim.AdamW(groups, weight_decay=self._settings.weight_decay, eps=1e-15, fused=True)
         self._generator = torch.Generator(job.device)
+        ground = self._settings.ground
+        self._ground = Ground(job.frames.positions, ground) if ground.weight else None
         self._resume()
 
     def train(self, step: int, batch: PixelBatch) -> dict[str, Tensor]:
@@ -225,7 +239,11 @@ class Run:
         targets = Targets(
             *(torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.labels, batch.features))
         )
-        return self._descend(self._rays(batch), targets, Sampling(jitter, exponent, trains_proposals))
+        sampling = Sampling(jitter, exponent, trains_proposals)
+        if self._ground is None:
+            return self._descend(self._rays(batch), targets, sampling)
+        start_m, end_m = (torch.from_numpy(value).to(self._job.device) for value in self._ground.stretches(batch))
+        return self._descend(replace(self._rays(batch), ends_m=end_m), targets, sampling, start_m)
 
     @property
     def passes(self) -> int:
@@ -242,9 +260,19 @@ class Run:
         """The exponent of the proposals' weights, and whether the proposals learn."""
         return schedule.anneal_exponent(step, self._settings), schedule.trains_proposals(step, self._settings)
 
-    def _descend(self, rays: Rays, targets: Targets, sampling: Sampling) -> dict[str, Tensor]:
-        """One step of the optimiser; its losses by name. On a card nothing here may wait for it: see CardRun."""
-        parts = self._losses(self.field(rays, sampling), targets, sampling.train_proposals)
+    def _descend(
+        self, rays: Rays, targets: Targets, sampling: Sampling, starts_m: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """One step of the optimiser; its losses by name. On a card nothing here may wait for it: see CardRun.
+
+        Where rays show the ground they must not end before `starts_m` (R,), metres; 0: nothing is known.
+        """
+        rendering = self.field(rays, sampling)
+        parts = self._losses(rendering, targets, sampling.train_proposals)
+        if starts_m is not None:
+            middles_m = (rendering.edges_m[:, 1:] + rendering.edges_m[:, :-1]) / 2
+            ground = losses.ground_loss(rendering.field.weights, middles_m, starts_m)
+            parts["ground"] = self._settings.ground.weight * ground
         torch.stack(list(parts.values())).sum().backward()
         self._optimiser.step()
         self._optimiser.zero_grad()
@@ -283,7 +311,8 @@ class Run:
             self._optimiser.state[parameter] = {quantity: values[name] for quantity, values in state.items()}
 
     def _rays(self, batch: PixelBatch) -> Rays:
-        return self.field.rays(batch.origins_world, batch.directions_world, self._videos[batch.rows], batch.rows)
+        videos, images = self._videos[batch.rows], self._images[batch.rows]
+        return self.field.rays(batch.origins_world, batch.directions_world, videos, images)
 
     def _losses(self, rendering: Rendering, targets: Targets, trains_proposals: bool) -> dict[str, Tensor]:
         """The five losses (paper, section 3.2), weighted."""
@@ -300,12 +329,11 @@ class Run:
         return parts
 
 
-def _new_field(job: TileTraining, video_count: int) -> TileField:
+def _new_field(job: TileTraining, video_count: int, image_count: int) -> TileField:
     """A field with random parameters that depend on the seed alone."""
     settings = job.settings
-    shape = FieldShape(
-        job.sub_fields, settings.field, settings.sampling, job.feature_channels, video_count, len(job.frames)
-    )
+    counts = (job.feature_channels, video_count, image_count)
+    shape = FieldShape(job.sub_fields, settings.field, settings.sampling, *counts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.training.seed)
         field = TileField(shape).to(job.device)

@@ -17,6 +17,7 @@ from pyarrow import parquet
 
 from presight_core.drives import Drive, FrameTable, Reject
 from presight_core.errors import NotFoundError, StoreError
+from presight_core.failpoints import failpoint
 from storage.folders import force_to_disk
 
 FORMAT = 1  # of the columns and metadata below
@@ -134,8 +135,10 @@ def _write_whole(table: pa.Table, file: Path) -> None:
             parquet.write_table(table, target, compression="zstd")
             target.flush()
             os.fsync(target.fileno())
+        failpoint("drive-before-rename")
         part.replace(file)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
     force_to_disk(file.parent)
+    failpoint("drive-after-rename")

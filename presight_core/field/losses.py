@@ -28,6 +28,15 @@ def sky_loss(
     return entropy.mean() if is_known is None else (entropy * is_known).sum() / is_known.sum().clamp_min(1)
 
 
+def ground_loss(
+    weights: Weights, middles_m: Float[Tensor, "rays bins"], start_m: Float[Tensor, " rays"]
+) -> Float[Tensor, ""]:
+    """Negative logarithm of the weight beyond `start_m`, mean over rays; rays that start at 0 cost nothing."""
+    beyond = (weights * (middles_m > start_m[:, None])).sum(-1)
+    # Below a thousandth the slope would be steeper than is good for a step.
+    return torch.where(start_m > 0, -beyond.clamp(1e-3, 1).log(), 0).mean()
+
+
 def distortion_loss(edges: Edges, weights: Weights) -> Tensor:
     """Mean over rays of `distortion`."""
     return distortion(edges, weights).mean()

@@ -64,6 +64,7 @@ class Rays:
     directions: Float[Tensor, "rays 3"]  # unit length
     videos: Int[Tensor, " rays"] | None = None
     images: Int[Tensor, " rays"] | None = None
+    ends_m: Float[Tensor, " rays"] | None = None  # nothing lies beyond; None or inf: the far plane
 
     def points(self, edges_m: Float[Tensor, "rays edges"]) -> Float[Tensor, "rays samples 3"]:
         """The middle of each stretch between two edges."""
@@ -228,6 +229,9 @@ class TileField(nn.Module):
         far_m = settings.far_m
         if settings.floor_m is not None:
             far_m = samplers.far_above_floor(rays.directions, far_m, settings.floor_m, settings.floor_slope)
+        if rays.ends_m is not None:
+            ends_m = rays.ends_m[:, None]
+            far_m = torch.minimum(ends_m, far_m) if isinstance(far_m, Tensor) else ends_m.clamp_max(far_m)
         return samplers.Spacing(settings.near_m, far_m, settings.linear_m)
 
     def place_samples(

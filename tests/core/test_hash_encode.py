@@ -3,7 +3,15 @@ import pytest
 import torch
 
 from presight_core.config import GridSettings
-from presight_core.field.hash_encode import GridLayout, grid_layout, hash_encode, torch_reference
+from presight_core.field.hash_encode import (
+    GridLayout,
+    grid_layout,
+    hash_encode,
+    numba_kernels,
+    point_gradient,
+    table_gradient,
+    torch_reference,
+)
 
 SIZES = [(4, 4), (3, 1), (3, 2)]  # levels and features: vector kernels need four, others take the scalar path
 
@@ -92,10 +100,31 @@ def test_table_gradient_agrees_with_finite_differences():
         torch.testing.assert_close((change * upstream).sum(), gradient[row].sum(), atol=1e-4, rtol=1e-4)
 
 
-def test_operator_passes_torchs_own_checks():
+def test_operators_pass_torchs_own_checks():
     points, segments, table, offsets, levels = arguments(small_layout(4, 4), 20)
-    table.requires_grad_()
-    torch.library.opcheck(hash_encode, (points, segments, table, offsets, levels))
+    upstream = torch.randn(20, 16)
+    where = (segments, offsets, levels)
+    torch.library.opcheck(point_gradient, (points, segments, table, offsets, levels, upstream))
+    torch.library.opcheck(table_gradient, (points, segments, upstream, offsets, levels, len(table)))
+    for copy in (None, table.bfloat16()):
+        needs = points.clone().requires_grad_(), table.clone().requires_grad_()
+        torch.library.opcheck(hash_encode, (needs[0], where[0], needs[1], *where[1:], copy))
+
+
+def test_two_runs_of_the_gradient_are_equal_bit_for_bit():
+    points, segments, table, offsets, levels = arguments(small_layout(4, 4), 5000)
+    upstream = torch.randn(5000, 16)
+    first, second = (table_gradient(points, segments, upstream, offsets, levels, len(table)) for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def test_asking_for_rows_of_a_large_table_ahead_changes_nothing():
+    settings = GridSettings(levels=2, features_per_level=4, max_resolution=4096, log2_rows=18)
+    layout = grid_layout(settings)
+    assert layout.rows[-1] * layout.features >= numba_kernels.PREFETCHED_VALUES
+    points, table = torch.rand(100, 3), torch.randn(layout.table_rows, 4)
+    inputs = (points, torch.tensor([0, 100]), table, layout.offsets(), layout.levels())
+    torch.testing.assert_close(hash_encode(*inputs), torch_reference.encode(*inputs), atol=1e-5, rtol=0)
 
 
 def test_result_does_not_depend_on_the_number_of_threads():
