@@ -17,6 +17,7 @@ from presight_core import classes
 from presight_core.errors import InputError
 from presight_core.field.tile_field import Rays
 from presight_core.pixels import FramePixels, PixelSource
+from stages.ray_pool import THIN
 
 HOST_BYTES = 3 << 30  # of a pool where the device is no card
 CARD_SHARE = 0.25  # of the card's free memory; the rest is for activations
@@ -46,11 +47,21 @@ class PoolFrames:
 
 
 @dataclass(frozen=True)
+class Choice:
+    """Which pixels are drawn."""
+
+    dynamic_classes: tuple[str, ...]  # never
+    thin_weight: float = 1.0  # how much likelier than others those of THIN classes are
+    seed: int = 0  # of the frames of an epoch
+
+
+@dataclass(frozen=True)
 class _Loaded:
-    """One decoded image, and its pixels (row by row) that show nothing dynamic."""
+    """One decoded image, and its pixels (row by row) that show nothing dynamic, those of thin things last."""
 
     pixels: FramePixels
     static: NDArray[np.int32]
+    thin_count: int
 
     @property
     def grids(self) -> dict[str, NDArray]:
@@ -71,14 +82,12 @@ class CardPool:
     while the present ones are in use. `version` rises when buffers had to be replaced by larger ones.
     """
 
-    def __init__(
-        self, frames: PoolFrames, source: PixelSource, dynamic_classes: tuple[str, ...], device: str, threads: int = 1
-    ) -> None:
+    def __init__(self, frames: PoolFrames, source: PixelSource, choice: Choice, device: str, threads: int = 1) -> None:
         """Nothing is decoded yet; see `show`. Raises InputError if the first image cannot be read."""
         self.version = 0
         self._frames, self._source, self._device = frames, source, device
-        self._is_dynamic = classes.lookup(dynamic_classes)
-        self._dynamic_names = ", ".join(dynamic_classes)
+        self._choice = choice
+        self._is_dynamic, self._is_thin = classes.lookup(choice.dynamic_classes), classes.lookup(THIN)
         self._executor = ThreadPoolExecutor(threads)
         self._coming: tuple[int, list[Future[_Loaded]]] | None = None
         self._epoch = -1
@@ -90,7 +99,7 @@ class CardPool:
         """Whether there are more frames than the pool can hold."""
         return self.capacity < len(self._frames.rows)
 
-    def show(self, epoch: int, seed: int) -> None:
+    def show(self, epoch: int) -> None:
         """Hold the images of an epoch, and begin to decode those of the next.
 
         Raises InputError if an image cannot be read, or all show hardly anything but dynamic things.
@@ -100,20 +109,25 @@ class CardPool:
             return
         coming, futures = self._coming or (-1, [])
         if coming != epoch:
-            futures = self._load(epoch, seed)
-        self._fill(self._choose(epoch, seed), [future.result() for future in futures])
+            futures = self._load(epoch)
+        self._fill(self._choose(epoch), [future.result() for future in futures])
         self._epoch = epoch
-        self._coming = (epoch + 1, self._load(epoch + 1, seed)) if self.changes else None
+        self._coming = (epoch + 1, self._load(epoch + 1)) if self.changes else None
 
     def draw(self, noise: Tensor) -> tuple[Rays, Targets]:
         """A ray and its targets for each row of uniform random numbers (R, 2).
 
-        A sub-field at random, a camera nearest to it, a pixel of that; pixels of dynamic things are passed over.
+        A sub-field at random, a camera nearest to it, a pixel of that; pixels of dynamic things are passed over, and
+        of the others too if `thin_weight` says so.
         """
         buffers = self._tensors
         image = torch.searchsorted(buffers["reached"], noise[:, 0].contiguous(), right=True)
-        count = buffers["static_counts"][image]
-        place = torch.minimum((noise[:, 1] * count).long(), count - 1)  # float32 may round up to the count
+        count, thin_count = buffers["static_counts"][image], buffers["thin_counts"][image]
+        # Thin things come last in an image's list, and are `thin_weight` as long there as elsewhere.
+        others, weight = count - thin_count, self._choice.thin_weight
+        place = noise[:, 1] * (others + weight * thin_count)
+        place = torch.where(place < others, place, others + (place - others) / weight)
+        place = torch.minimum(place.long(), count - 1)  # float32 may round up to the count
         pixel = buffers["static"][buffers["static_starts"][image] + place].long()
         size = buffers["rgb_sizes"][image]
         column, row = pixel % size[:, 0], pixel // size[:, 0]
@@ -143,11 +157,11 @@ class CardPool:
         room = torch.cuda.mem_get_info(self._device)[0] * CARD_SHARE if on_card else HOST_BYTES
         return max(1, int(room) // of_image)
 
-    def _choose(self, epoch: int, seed: int) -> NDArray[np.int64]:
+    def _choose(self, epoch: int) -> NDArray[np.int64]:
         """Frames of an epoch, as many of each sub-field as there is room for."""
         if not self.changes:
             return np.arange(len(self._frames.rows))
-        order = np.random.default_rng([seed, epoch, 1]).permutation(len(self._frames.rows))
+        order = np.random.default_rng([self._choice.seed, epoch, 1]).permutation(len(self._frames.rows))
         owner = self._frames.sub_fields[order]
         by_owner = np.argsort(owner, kind="stable")
         starts = np.searchsorted(owner[by_owner], owner[by_owner])
@@ -155,8 +169,8 @@ class CardPool:
         rank[by_owner] = np.arange(len(order)) - starts
         return np.sort(order[np.argsort(rank, kind="stable")[: self.capacity]])
 
-    def _load(self, epoch: int, seed: int) -> list[Future[_Loaded]]:
-        return [self._executor.submit(self._load_one, frame) for frame in self._choose(epoch, seed).tolist()]
+    def _load(self, epoch: int) -> list[Future[_Loaded]]:
+        return [self._executor.submit(self._load_one, frame) for frame in self._choose(epoch).tolist()]
 
     def _load_one(self, frame: int) -> _Loaded:
         pixels = self._source.load(int(self._frames.rows[frame]))
@@ -165,22 +179,28 @@ class CardPool:
             (2 * np.arange(count) + 1) * label_count // (2 * count)
             for count, label_count in zip(pixels.rgb.shape[:2], pixels.labels.shape, strict=True)
         )
-        is_dynamic = self._is_dynamic[pixels.labels[np.ix_(*cells)]]
-        return _Loaded(pixels, np.flatnonzero(~is_dynamic).astype(np.int32))
+        labels = pixels.labels[np.ix_(*cells)]
+        is_thin = self._is_thin[labels] & ~self._is_dynamic[labels]
+        thin = np.flatnonzero(is_thin)
+        others = np.flatnonzero(~is_thin & ~self._is_dynamic[labels])
+        return _Loaded(pixels, np.concatenate([others, thin]).astype(np.int32), len(thin))
 
     def _fill(self, chosen: NDArray[np.int64], images: Sequence[_Loaded]) -> None:
         frames = self._frames
         counts = np.array([len(image.static) for image in images])
+        thin_counts = np.array([image.thin_count for image in images])
         sizes = np.array([[grid.shape[1::-1] for grid in _grids(image)] for image in images], np.int64)
-        share = counts / sizes[:, 0].prod(-1) / np.bincount(frames.sub_fields[chosen])[frames.sub_fields[chosen]]
+        weights = counts + (self._choice.thin_weight - 1) * thin_counts
+        cameras = np.bincount(frames.sub_fields[chosen])[frames.sub_fields[chosen]]
+        share = weights / sizes[:, 0].prod(-1) / cameras
         if not counts.any():
             raise InputError(
-                f"{len(chosen)} images show nothing but {self._dynamic_names}; "
+                f"{len(chosen)} images show nothing but {', '.join(self._choice.dynamic_classes)}; "
                 "check their label maps, or shorten features.dynamic_classes"
             )
         reached = (np.cumsum(share) / share.sum()).astype(np.float32)
         reached[np.flatnonzero(counts)[-1] :] = 1  # random numbers are below
-        values = {"reached": reached, "static_counts": counts}
+        values = {"reached": reached, "static_counts": counts, "thin_counts": thin_counts}
         values |= {f"{name}_sizes": sizes[:, i] for i, name in enumerate(("rgb", "labels", "features"))}
         values |= {
             name: getattr(frames, name)[chosen]

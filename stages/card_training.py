@@ -18,7 +18,7 @@ from torch import Tensor
 from presight_core.field import schedule, threads
 from presight_core.field.tile_field import Sampling
 from presight_core.pixels import PixelSource
-from stages.card_pool import CardPool, PoolFrames
+from stages.card_pool import CardPool, Choice, PoolFrames
 from stages.training import POOL_STEPS, Run, TileTraining
 
 EAGER_STEPS = 3  # of each kind before it is recorded: kernels get compiled, and the optimiser's state made
@@ -37,9 +37,8 @@ class CardRun(Run):
         self, job: TileTraining, scratch: Path, source: PixelSource, rows: NDArray[np.int64], replays: bool = True
     ) -> None:
         super().__init__(job, scratch)
-        self.pool = CardPool(
-            self._pool_frames(rows), source, job.settings.features.dynamic_classes, job.device, job.threads
-        )
+        choice = Choice(job.settings.features.dynamic_classes, self._settings.thin_weight, self._settings.seed)
+        self.pool = CardPool(self._pool_frames(rows), source, choice, job.device, job.threads)
         size = (self._settings.batch_rays, DRAWS + self.passes)
         self._noise = torch.empty(size, device=job.device)
         self._anneal, self._rate = torch.ones((), device=job.device), torch.zeros((), device=job.device)
@@ -51,7 +50,7 @@ class CardRun(Run):
 
     def advance(self, step: int) -> Losses:
         """One step of the optimiser; its losses by name, which the next step overwrites."""
-        self.pool.show(step // POOL_STEPS, self._settings.seed)
+        self.pool.show(step // POOL_STEPS)
         if self._version != self.pool.version:  # buffers have moved: what was recorded would read the old ones
             self._version = self.pool.version
             self._recordings = self._new_recordings()
@@ -129,6 +128,10 @@ class Recording:
 
 
 def suits(job: TileTraining) -> bool:
-    """Whether a tile's steps can be recorded: on a card whose matrix units take bfloat16, and if that is wanted."""
-    on_card = job.device.startswith("cuda")
-    return on_card and job.settings.training.bfloat16 and threads.has_fast_bfloat16(job.device)
+    """Whether a tile's steps can be recorded: on a card whose matrix units take bfloat16, and if that is wanted.
+
+    What is known of the ground is looked up by the host for every ray, so that such steps cannot be.
+    """
+    settings = job.settings.training
+    wanted = settings.bfloat16 and not settings.ground.weight
+    return wanted and job.device.startswith("cuda") and threads.has_fast_bfloat16(job.device)

@@ -76,7 +76,7 @@ def draws(count: int) -> torch.Tensor:
 
 def test_rays_and_targets_are_those_of_the_pool_on_the_host(tmp_path):
     run = card_run(tmp_path)
-    run.pool.show(0, 0)
+    run.pool.show(0)
     rays, targets = run.pool.draw(draws(300))
     images, columns, rows = targets.rgb.numpy().astype(np.int64).T
     expected = RayPool(frames(), Numbered(), np.arange(4)).at(images, np.stack([columns, rows], -1))
@@ -90,7 +90,7 @@ def test_rays_and_targets_are_those_of_the_pool_on_the_host(tmp_path):
 
 def test_dynamic_pixels_are_never_drawn_and_all_others_are(tmp_path):
     run = card_run(tmp_path)
-    run.pool.show(0, 0)
+    run.pool.show(0)
     _, targets = run.pool.draw(draws(20_000))
     assert not (targets.labels == CAR).any()
     static = sum(HEIGHT * (WIDTH - 2 * Numbered.hidden(row)) for row in range(4))
@@ -99,16 +99,30 @@ def test_dynamic_pixels_are_never_drawn_and_all_others_are(tmp_path):
 
 def test_images_are_drawn_as_by_rejection_with_equal_shares_for_sub_fields(tmp_path):
     run = card_run(tmp_path)
-    run.pool.show(0, 0)
+    run.pool.show(0)
     _, targets = run.pool.draw(draws(50_000))
     found = np.bincount(targets.rgb[:, 0].numpy(), minlength=4) / 50_000
     share = np.array([1 - Numbered.hidden(row) / 6 for row in range(4)]) / (3, 3, 3, 1)  # cameras of the sub-field
     np.testing.assert_allclose(found, share / share.sum(), atol=0.01)
 
 
+def test_thin_things_are_drawn_more_often(tmp_path, monkeypatch):
+    def load(_: Numbered, row: int) -> FramePixels:
+        labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+        labels[:, row] = classes.CITYSCAPES.index("pole")
+        return FramePixels(np.zeros((HEIGHT, WIDTH, 3), np.uint8), labels, np.zeros((2, 3, 3), np.uint8))
+
+    monkeypatch.setattr(Numbered, "load", load)
+    run = card_run(tmp_path, "training.thin_weight=3.0")
+    run.pool.show(0)
+    _, targets = run.pool.draw(draws(50_000))
+    found = float((targets.labels > 0).float().mean())
+    assert found == pytest.approx(3 / (3 + WIDTH - 1), abs=0.01)  # one column of twelve
+
+
 def test_the_largest_random_number_still_draws_a_pixel(tmp_path):
     run = card_run(tmp_path)
-    run.pool.show(0, 0)
+    run.pool.show(0)
     below_one = float(np.nextafter(np.float32(1), np.float32(0)))
     _, targets = run.pool.draw(torch.tensor([[below_one, below_one], [0, 0]]))
     assert targets.rgb.tolist() == [[3, WIDTH - 1, HEIGHT - 1], [0, 0, 0]]
@@ -120,7 +134,7 @@ def test_a_small_pool_shows_other_images_each_epoch_in_the_same_buffers(tmp_path
     assert run.pool.capacity == 2
     shown, versions = [], []
     for epoch in range(6):
-        run.pool.show(epoch, 0)
+        run.pool.show(epoch)
         shown.append(set(run.pool.draw(draws(200))[1].rgb[:, 0].tolist()))
         versions.append(run.pool.version)
     run.close()
@@ -133,7 +147,7 @@ def test_images_of_nothing_but_traffic_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(Numbered, "hidden", staticmethod(lambda row: 6))
     run = card_run(tmp_path)
     with pytest.raises(InputError, match=r"shorten features\.dynamic_classes"):
-        run.pool.show(0, 0)
+        run.pool.show(0)
 
 
 def test_steps_lower_the_loss(tmp_path):
@@ -167,8 +181,9 @@ def test_only_cards_with_bfloat16_record_steps(monkeypatch):
     monkeypatch.setattr("presight_core.field.threads.has_fast_bfloat16", lambda device: True)
     assert card_training.suits(TileTraining("t", frames(), SUB_FIELDS, tiny_settings(), 3, device="cuda:1"))
     assert not card_training.suits(TileTraining("t", frames(), SUB_FIELDS, tiny_settings(), 3, device="cpu"))
-    exact = tiny_settings("training.bfloat16=false")
-    assert not card_training.suits(TileTraining("t", frames(), SUB_FIELDS, exact, 3, device="cuda"))
+    for override in ("training.bfloat16=false", "training.ground.weight=0.1"):
+        settings = tiny_settings(override)
+        assert not card_training.suits(TileTraining("t", frames(), SUB_FIELDS, settings, 3, device="cuda"))
 
 
 @pytest.mark.slow
