@@ -90,6 +90,19 @@ def test_every_parameter_learns():
     assert idle == []
 
 
+def test_copies_of_tables_are_read_and_follow_the_tables():
+    field, rays = small_field(), random_rays(5)
+    exact = field(field.rays(*rays)).rgb
+    field.use_copies(torch.bfloat16)
+    torch.testing.assert_close(field(field.rays(*rays)).rgb, exact, atol=1e-3, rtol=0)
+    with torch.no_grad():
+        field.trunk.grid.table.normal_()
+    torch.testing.assert_close(field(field.rays(*rays)).rgb, exact, atol=1e-3, rtol=0)
+    field.refresh_copies()
+    assert float((field(field.rays(*rays)).rgb - exact).detach().abs().max()) > 0.01
+    assert not any("copy" in name for name in field.state_dict())
+
+
 def test_sky_features_ignore_the_video():
     field = small_field()
     origins, directions = random_rays(5)
