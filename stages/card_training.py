@@ -7,6 +7,7 @@ lies in tensors that are written before each replay.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from torch import Tensor
 from presight_core.field import schedule, threads
 from presight_core.field.tile_field import Sampling
 from presight_core.pixels import PixelSource
+from stages.card_ground import CardGround
 from stages.card_pool import CardPool, Choice, PoolFrames
 from stages.training import POOL_STEPS, Run, TileTraining
 
@@ -39,6 +41,9 @@ class CardRun(Run):
         super().__init__(job, scratch)
         choice = Choice(job.settings.features.dynamic_classes, self._settings.thin_weight, self._settings.seed)
         self.pool = CardPool(self._pool_frames(rows), source, choice, job.device, job.threads)
+        positions, ground = job.frames.positions, self._settings.ground
+        origin_m = self.field.origin_m
+        self._card_ground = CardGround(positions, origin_m, ground, job.device) if ground.weight else None
         size = (self._settings.batch_rays, DRAWS + self.passes)
         self._noise = torch.empty(size, device=job.device)
         self._anneal, self._rate = torch.ones((), device=job.device), torch.zeros((), device=job.device)
@@ -74,7 +79,11 @@ class CardRun(Run):
     def _body(self, trains_proposals: bool) -> Losses:
         draws, jitter = self._noise.split([DRAWS, self.passes], -1)
         rays, targets = self.pool.draw(draws)
-        return self._descend(rays, targets, Sampling(jitter, self._anneal, trains_proposals))
+        sampling = Sampling(jitter, self._anneal, trains_proposals)
+        if self._card_ground is None:
+            return self._descend(rays, targets, sampling)
+        start_m, end_m = self._card_ground.stretches(rays, targets.labels)
+        return self._descend(replace(rays, ends_m=end_m), targets, sampling, start_m)
 
     def _pool_frames(self, rows: NDArray[np.int64]) -> PoolFrames:
         frames = self._job.frames.select(rows)
@@ -128,10 +137,6 @@ class Recording:
 
 
 def suits(job: TileTraining) -> bool:
-    """Whether a tile's steps can be recorded: on a card whose matrix units take bfloat16, and if that is wanted.
-
-    What is known of the ground is looked up by the host for every ray, so that such steps cannot be.
-    """
-    settings = job.settings.training
-    wanted = settings.bfloat16 and not settings.ground.weight
-    return wanted and job.device.startswith("cuda") and threads.has_fast_bfloat16(job.device)
+    """Whether a tile's steps can be recorded: on a card whose matrix units take bfloat16, and if that is wanted."""
+    on_card = job.device.startswith("cuda")
+    return on_card and job.settings.training.bfloat16 and threads.has_fast_bfloat16(job.device)

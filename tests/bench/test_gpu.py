@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-pytest.importorskip("triton")
+pytest.importorskip("triton", minversion="3.9")
 
 BENCH = Path(__file__).parents[2] / "bench"
 SECTIONS = (

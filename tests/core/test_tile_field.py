@@ -99,7 +99,7 @@ def test_copies_of_tables_are_read_and_follow_the_tables():
         field.trunk.grid.table.normal_()
     torch.testing.assert_close(field(field.rays(*rays)).rgb, exact, atol=1e-3, rtol=0)
     field.refresh_copies()
-    assert float((field(field.rays(*rays)).rgb - exact).detach().abs().max()) > 0.01
+    assert float((field(field.rays(*rays)).rgb - exact).detach().abs().max()) > 0.003
     assert not any("copy" in name for name in field.state_dict())
 
 

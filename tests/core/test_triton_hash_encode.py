@@ -5,7 +5,7 @@ import pytest
 
 from tests.core.without_card import compile_for_hopper, interpreted
 
-pytest.importorskip("triton")
+pytest.importorskip("triton", minversion="3.9")
 pytestmark = pytest.mark.slow
 
 TOLERANCES = {

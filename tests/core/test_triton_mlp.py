@@ -4,7 +4,7 @@ import pytest
 
 from tests.core.without_card import compile_for_hopper, interpreted
 
-pytest.importorskip("triton")
+pytest.importorskip("triton", minversion="3.9")
 pytestmark = pytest.mark.slow
 
 SHARED_BYTES = 227 * 1024  # of one block of threads on a card of compute capability 9.0

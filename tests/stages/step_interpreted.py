@@ -16,6 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.stages.test_card_training import card_run
 
 SMALL = (
+    "training.ground.weight=0.1",
     "training.bfloat16=false",
     "training.batch_rays=8",
     "sampling.proposal_samples=[4, 3]",

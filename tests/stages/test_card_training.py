@@ -6,15 +6,19 @@ import pytest
 import torch
 
 from presight_core import classes
+from presight_core.config import GroundSettings
 from presight_core.drives import FrameTable
 from presight_core.errors import InputError
 from presight_core.field.checkpoint import load_field
+from presight_core.field.tile_field import Rays
 from presight_core.frames import planar_transform
 from presight_core.pixels import FramePixels
 from presight_core.tiles import SubField
 from stages import card_pool, card_training
+from stages.card_ground import CardGround
 from stages.card_training import CardRun
-from stages.ray_pool import RayPool
+from stages.ground import SIDEWALK, Ground
+from stages.ray_pool import PixelBatch, RayPool
 from stages.training import TileTraining, train_tile
 from tests.core.without_card import interpreted
 from tests.stages.small_training import tiny_settings
@@ -150,6 +154,31 @@ def test_images_of_nothing_but_traffic_are_refused(tmp_path, monkeypatch):
         run.pool.show(0)
 
 
+def test_the_ground_is_where_the_host_finds_it():
+    settings, random = GroundSettings(weight=0.1, reach_m=5), np.random.default_rng(0)
+    cameras = np.stack([np.linspace(0, 60, 30), np.zeros(30), np.linspace(0, 6, 30)], -1) + np.array([5e5, 0, 40])
+    origin_m = cameras.mean(0)
+    count = 2000
+    directions = random.normal(size=(count, 3)) * (1, 0.3, 0.4)
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    labels = random.choice([0, SIDEWALK, classes.SKY], count).astype(np.uint8)
+    origins = cameras[random.integers(30, size=count)]
+    nothing = np.zeros((count, 3), np.uint8)
+    expected = Ground(cameras, settings).stretches(
+        PixelBatch(np.zeros(count, np.int64), origins, directions, nothing, labels, nothing)
+    )
+    rays = Rays(*(torch.from_numpy(value.astype(np.float32)) for value in (origins - origin_m, directions)))
+    found = CardGround(cameras, origin_m, settings, "cpu").stretches(rays, torch.from_numpy(labels))
+    known = np.isfinite(expected.end_m) & torch.isfinite(found[1]).numpy()
+    assert (np.isfinite(expected.end_m) != torch.isfinite(found[1]).numpy()).mean() < 0.02  # at the edge of the reach
+    assert known.mean() > 0.05
+    for one, other in zip(found, expected, strict=True):
+        error_m = np.abs(one.numpy()[known] - other[known]) * -directions[known, 2]  # up and down
+        assert np.median(error_m) < 0.02
+        assert error_m.max() < 0.25  # two places of cameras farther: the next cell asks other ones
+    assert (found[0].numpy()[~np.isfinite(found[1].numpy())] == 0).all()
+
+
 def test_steps_lower_the_loss(tmp_path):
     run = card_run(tmp_path, "training.steps=60", "training.warmup=0.0")
     totals = [float(sum(run.advance(step).values())) for step in range(60)]
@@ -181,14 +210,13 @@ def test_only_cards_with_bfloat16_record_steps(monkeypatch):
     monkeypatch.setattr("presight_core.field.threads.has_fast_bfloat16", lambda device: True)
     assert card_training.suits(TileTraining("t", frames(), SUB_FIELDS, tiny_settings(), 3, device="cuda:1"))
     assert not card_training.suits(TileTraining("t", frames(), SUB_FIELDS, tiny_settings(), 3, device="cpu"))
-    for override in ("training.bfloat16=false", "training.ground.weight=0.1"):
-        settings = tiny_settings(override)
-        assert not card_training.suits(TileTraining("t", frames(), SUB_FIELDS, settings, 3, device="cuda"))
+    exact = tiny_settings("training.bfloat16=false")
+    assert not card_training.suits(TileTraining("t", frames(), SUB_FIELDS, exact, 3, device="cuda"))
 
 
 @pytest.mark.slow
 def test_nothing_in_a_step_waits_for_the_card_and_its_losses_are_right(tmp_path):
-    pytest.importorskip("triton")
+    pytest.importorskip("triton", minversion="3.9")
     on_card = interpreted("tests.stages.step_interpreted", tmp_path / "card")
     assert on_card["waiting"] == []
     on_host = interpreted("tests.stages.step_interpreted", tmp_path / "host", interpret=False)
