@@ -16,6 +16,7 @@ from flows.reconcile import hold_city
 from presight_core.config import load_city_settings
 from presight_core.recipes import Recipe
 from storage.leases import Lease
+from storage.restoration import remember_tiling
 from storage.workspace import Workspace
 
 CITY_ROW = "all tiles"  # the catalog's row of what belongs to no tile: the feature space and the features
@@ -75,6 +76,7 @@ def freeze(workspace: Workspace, plan: CityPlan, lease: Lease) -> None:
     workspace.catalog().save_tiling(plan.tiling, plan.settings.tiling.model_dump(mode="json"))
     channels = workspace.artifacts().space(plan.space_id).channel_count
     workspace.store().create_city(plan.city, plan.lattice, plan.space_id, channels)
+    remember_tiling(workspace.store(), workspace.catalog(), plan.tiling)
     if lease.follows_lost:  # when the lease was taken the store may not have known the city
         workspace.store().raise_fence(plan.city, lease.token)
 

@@ -6,7 +6,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from presight_core.errors import MissingDependencyError, PresightError
+from presight_core.errors import MissingDependencyError, PresightError, StoreError
 
 app = typer.Typer(
     help="Turn the camera logs of past drives into a city's neural prior.",
@@ -15,6 +15,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+catalog_commands = typer.Typer(help="Look after the catalog.", no_args_is_help=True)
+app.add_typer(catalog_commands, name="catalog")
 
 City = Annotated[
     str, typer.Argument(help="City: the log location, for example singapore-onenorth.", show_default=False)
@@ -88,6 +91,14 @@ def build(
     from flows.build import build_city
 
     build_city(context.obj, city, override or [], parallel, as_json, wait)
+
+
+@catalog_commands.command("rebuild")
+def rebuild_catalog(context: typer.Context, as_json: AsJson = False) -> None:
+    """Make a lost catalog again, from the store and the index of drives."""
+    from flows.reconcile import rebuild
+
+    rebuild(context.obj, as_json)
 
 
 @app.command()
@@ -186,6 +197,8 @@ def main() -> None:
         app()
     except PresightError as error:
         _fail(error)
+    except OSError as error:
+        _fail(StoreError(f"{error}; check the disk's space and your access to it, then run again"))
     except ModuleNotFoundError as error:
         cure = "this command needs the whole pipeline: pip install '.[pipeline]' (README, Install)"
         _fail(MissingDependencyError(f"{error}; {cure}"))

@@ -11,6 +11,7 @@ from presight_core.priors.documents import Generation, GenerationTile, TileEntry
 from stages.validation import validate_tile
 from storage.leases import Lease
 from storage.priors import PriorStore
+from storage.restoration import remember_build
 from storage.workspace import Workspace
 
 
@@ -57,14 +58,19 @@ def publish(
     number = plan.generation
     if accepted:
         names = {drive.drive_id: drive.name for drive in plan.drives}
-        tiles = {tile.job.tile_id: tile.tile(names) for tile in accepted}
+        rows = {build.build_id: build for build in catalog.running(plan.city)}
+        now = catalog.now()
+        tiles = {
+            tile.job.tile_id: remember_build(tile.tile(names), rows.get(tile.job.build_id), now) for tile in accepted
+        }
         failpoint("publish-before")
         # In this order: whoever takes the lease after this line raises the fence before they do anything else.
         catalog.leases.require(lease)
         number = store.publish(plan.city, tiles, plan.generation, plan.tiling.to_json(), lease.token)
         failpoint("publish-after")
-    for tile in accepted:
-        catalog.finish_build(tile.job.build_id, "published", {**tile.metrics, "generation": number})
+        for tile in accepted:
+            metrics = {**tile.metrics, "generation": number}
+            catalog.finish_build(tile.job.build_id, "published", metrics, finished_at=now)
     for job, error in failed.values():
         catalog.finish_build(job.build_id, "failed", {}, error)
     return {

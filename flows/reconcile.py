@@ -18,6 +18,7 @@ from presight_core.priors.documents import Generation
 from storage.catalog import Build, Catalog
 from storage.leases import Lease, LeaseHeldError, LeaseLostError, this_process
 from storage.priors import PriorStore
+from storage.restoration import restore
 from storage.workspace import Workspace
 
 POLL_S = 1.0  # how often a waiting run looks whether the city is free
@@ -66,9 +67,10 @@ def end_orphans(workspace: Workspace, city: str, reason: str = RUN_ENDED) -> lis
     for build in orphans:
         if _is_shown(head, build):
             assert head is not None
-            metrics = {**head.tiles[build.tile_id].lineage.get("metrics", {})}
-            number = _first_showing(store, head, build.tile_id)
-            catalog.finish_build(build.build_id, "published", {**metrics, "generation": number})
+            lineage = head.tiles[build.tile_id].lineage
+            metrics = {**lineage.get("metrics", {}), "generation": _first_showing(store, head, build.tile_id)}
+            finished_at = lineage.get("build", {}).get("finished_at")
+            catalog.finish_build(build.build_id, "published", metrics, finished_at=finished_at)
         else:
             error = f"{reason}; last heard of at {build.updated_at}; run `presight build {city}`"
             with suppress(ConflictError):  # two may find it at once
@@ -101,6 +103,16 @@ def show_reconciled(folder: Path, city: str | None, as_json: bool) -> None:
     for build in ended:
         print(f"{build.city}  {build.tile_id}  {build.state}  {build.error}".rstrip())
     print(f"{len(ended)} builds of dead runs ended" if ended else "nothing to reconcile")
+
+
+def rebuild(folder: Path, as_json: bool) -> None:
+    """Make the catalog of a workspace again. Raises ConflictError if it is not empty."""
+    workspace = Workspace.open(folder)
+    counts = restore(workspace.catalog(), workspace.drives(), workspace.store())
+    if as_json:
+        print_json(counts)
+        return
+    print(", ".join(f"{count} {name}" for name, count in counts.items()) + f" in {workspace.catalog_url}")
 
 
 def _take(workspace: Workspace, catalog: Catalog, city: str, wait: bool) -> Lease:

@@ -71,7 +71,11 @@ class Catalog:
             upgrade(database)
         return Catalog(database, clock)
 
-    def add_drive(self, drive: "Drive", rejects: "Sequence[Reject]" = ()) -> bool:
+    def now(self) -> str:
+        """The time by the catalog's clock, as it is recorded."""
+        return self._now()
+
+    def add_drive(self, drive: "Drive", rejects: "Sequence[Reject]" = (), added_at: str | None = None) -> bool:
         """Record a drive and what was refused of it; False if it is there already, then only its place is updated.
 
         A drive of the same scene, root and version with other content is replaced: it is removed from its city.
@@ -79,22 +83,23 @@ class Catalog:
         """
         if not drive.frame_count:
             raise InputError(f"{drive.name}: no good frame; correct what its rejects name and ingest it again")
+        now = added_at or self._now()
         with self._database.writing() as query:
             known = query("SELECT removed_at FROM drives WHERE drive_id = :drive_id", drive_id=drive.drive_id)
-            self._remove(query, "root = :root AND version = :version AND name = :name AND drive_id <> :drive_id", drive)
+            query(REMOVE_DRIVES + SAME_SCENE, **asdict(drive), now=now)
             if known:
                 query(REPLACE_DRIVE, **asdict(drive))
                 return known[0]["removed_at"] is not None
-            query(ADD_DRIVE, **asdict(drive), added_at=self._now())
+            query(ADD_DRIVE, **asdict(drive), added_at=now)
             _add_rejects(query, drive.drive_id, rejects)
             return True
 
-    def remove_drive(self, drive_id: str) -> None:
+    def remove_drive(self, drive_id: str, removed_at: str | None = None) -> None:
         """Take a drive out of its city; its record stays. Raises NotFoundError if there is none."""
         with self._database.writing() as query:
             if not query("SELECT 1 FROM drives WHERE drive_id = :drive_id", drive_id=drive_id):
                 raise NotFoundError(f"no drive {drive_id}; `presight status` lists what there is")
-            query(REMOVE_DRIVES + "drive_id = :drive_id", drive_id=drive_id, now=self._now())
+            query(REMOVE_DRIVES + "drive_id = :drive_id", drive_id=drive_id, now=removed_at or self._now())
 
     def drives(self, city: str | None = None) -> "list[Drive]":
         """The drives of a city, or of all, by capture time."""
@@ -128,7 +133,7 @@ class Catalog:
         with self._database.reading() as query:
             return [Reject(**row) for row in query(REJECTS_OF_CITY, city=city)]
 
-    def save_tiling(self, tiling: "Tiling", settings: Mapping[str, Any]) -> None:
+    def save_tiling(self, tiling: "Tiling", settings: Mapping[str, Any], created_at: str | None = None) -> None:
         """Record a tiling, or append its new tiles to the recorded one. The newest tiling is its city's.
 
         Raises ConflictError if a recorded tile would move or vanish.
@@ -144,7 +149,7 @@ class Catalog:
                     city=tiling.city,
                     tiling_id=tiling.tiling_id,
                     settings=json.dumps(settings, sort_keys=True),
-                    created_at=self._now(),
+                    created_at=created_at or self._now(),
                 )[0]["tiling_number"]
             _require_unmoved(tiling, tiles)
             for place, tile in enumerate(tiling.tiles[len(tiles) :], start=len(tiles)):
@@ -169,6 +174,12 @@ class Catalog:
             newest = query(NEWEST_TILING, city=city)
         return json.loads(newest[0]["settings"]) if newest else {}
 
+    def tiling_created_at(self, city: str) -> str | None:
+        """When the city's tiling was first recorded."""
+        with self._database.reading() as query:
+            newest = query(NEWEST_TILING, city=city)
+        return newest[0]["created_at"] if newest else None
+
     def start_build(self, city: str, tile_id: str, recipe: "Recipe", lease: Lease | None = None) -> int:
         """Record the start of a build; its id. Raises LeaseLostError if the lease is no longer the city's."""
         values = {"city": city, "tile_id": tile_id, "recipe": json.dumps(recipe.to_json()), "digest": recipe.digest}
@@ -186,16 +197,21 @@ class Catalog:
             return bool(query(PROGRESS, build_id=build_id, **values))
 
     def finish_build(
-        self, build_id: int, state: Ending, metrics: Mapping[str, Any] | None = None, error: str = ""
+        self,
+        build_id: int,
+        state: Ending,
+        metrics: Mapping[str, Any] | None = None,
+        error: str = "",
+        finished_at: str | None = None,
     ) -> None:
-        """Record a build's end. `metrics` None leaves those recorded before.
+        """Record a build's end, now or at a time told. `metrics` None leaves those recorded before.
 
         Raises NotFoundError for no such build, ConflictError for one that failed already: its run was taken for dead.
         """
         encoded = None if metrics is None else json.dumps(dict(metrics))
         with self._database.writing() as query:
             values = {"build_id": build_id, "state": state, "metrics": encoded, "error": error}
-            if not query(FINISH_BUILD, **values, now=self._now()):
+            if not query(FINISH_BUILD, **values, now=finished_at or self._now()):
                 if query("SELECT 1 FROM builds WHERE build_id = :build_id", build_id=build_id):
                     raise ConflictError(f"build {build_id} was ended before, as failed; run `presight build` again")
                 raise NotFoundError(f"no build {build_id}; start it with start_build")
@@ -206,6 +222,15 @@ class Catalog:
             rows = query(LATEST_BUILDS, city=city, state=state)
         return [_build(row) for row in rows]
 
+    def restore_build(self, build: Build) -> None:
+        """Record a build that ended long ago, under a number of its own."""
+        values = {
+            **vars(build),
+            **{name: json.dumps(getattr(build, name)) for name in ("recipe", "figures", "metrics")},
+        }
+        with self._database.writing() as query:
+            query(RESTORE_BUILD, **{name: value for name, value in values.items() if name != "build_id"})
+
     def running(self, city: str) -> list[Build]:
         """Builds of a city that are not ended."""
         with self._database.reading() as query:
@@ -215,9 +240,6 @@ class Catalog:
         """Running builds, of a city or of all, whose lease is over: nobody works on them, and nobody ever will."""
         with self._database.reading() as query:
             return [_build(row) for row in query(ORPHANS, city=city)]
-
-    def _remove(self, query: Query, which: str, drive: "Drive") -> None:
-        query(REMOVE_DRIVES + which, **asdict(drive), now=self._now())
 
     def _now(self) -> str:
         return text_of(self._clock())
@@ -250,6 +272,7 @@ REMOVE_DRIVES = "UPDATE drives SET removed_at = :now WHERE removed_at IS NULL AN
 ADD_REJECT = """
     INSERT INTO rejects (drive_id, code, file, detail, cure, drive)
     VALUES (:drive_id, :code, :file, :detail, :cure, :drive)"""
+SAME_SCENE = "root = :root AND version = :version AND name = :name AND drive_id <> :drive_id"
 REJECTS_OF_DRIVE = "SELECT code, file, detail FROM rejects WHERE drive_id = :drive_id"
 REJECTS_OF_CITY = """
     SELECT code, file, detail, cure, drive FROM rejects WHERE drive_id IN
@@ -267,6 +290,11 @@ START_BUILD = """
                         started_at, updated_at, lease_token)
     VALUES (:city, :tile_id, :recipe, :digest, 'running', '', 0, 0, '{}', '{}', '', :now, :now, :token)
     RETURNING build_id"""
+RESTORE_BUILD = """
+    INSERT INTO builds (city, tile_id, recipe, recipe_digest, state, stage, done, total, figures, metrics, error,
+                        started_at, updated_at, finished_at, lease_token)
+    VALUES (:city, :tile_id, :recipe, :recipe_digest, :state, :stage, :done, :total, :figures, :metrics, :error,
+            :started_at, :updated_at, :finished_at, :lease_token)"""
 PROGRESS = """
     UPDATE builds SET stage = :stage, done = :done, total = :total, figures = :figures, updated_at = :now
     WHERE build_id = :build_id AND state = 'running' RETURNING build_id"""

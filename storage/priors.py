@@ -213,6 +213,11 @@ class PriorStore:
         if not put_once(self._objects, path, content) and self._source.read(path) != content:
             raise ConflictError(f"{self.location}/{path} is there with other content; use another name")
 
+    def documents(self, city: str, kind: str) -> list[str]:
+        """Names of the documents of a kind that `save_document` kept, sorted."""
+        names = self._source.names(f"{checked_name(city)}/{checked_name(kind)}")
+        return [name.removesuffix(".json") for name in names if name.endswith(".json")]
+
     def document(self, city: str, kind: str, name: str) -> dict[str, Any]:
         """A document that `save_document` kept. Raises NotFoundError if it is not there."""
         path = _document_path(city, kind, name)
