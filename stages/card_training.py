@@ -21,7 +21,8 @@ from presight_core.field.tile_field import Sampling
 from presight_core.pixels import PixelSource
 from stages.card_ground import CardGround
 from stages.card_pool import CardPool, Choice, PoolFrames
-from stages.training import POOL_STEPS, Run, TileTraining
+from stages.feeding import POOL_STEPS
+from stages.training import Run, TileTraining
 
 EAGER_STEPS = 3  # of each kind before it is recorded: kernels get compiled, and the optimiser's state made
 DRAWS = 2  # random numbers that choose a ray: which image, which pixel

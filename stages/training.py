@@ -2,8 +2,8 @@
 
 import hashlib
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,23 +18,23 @@ from presight_core.config import CitySettings, TrainingSettings
 from presight_core.drives import FrameTable
 from presight_core.errors import BuildError, InputError, NotFoundError
 from presight_core.field import checkpoint, losses, schedule, threads
-from presight_core.field.tile_field import FieldShape, Rays, Rendering, Sampling, TileField
+from presight_core.field.rays import Rays
+from presight_core.field.tile_field import FieldShape, Rendering, Sampling, TileField
 from presight_core.pixels import PixelSource
 from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import Recipe
 from presight_core.tiles import SubField
 from stages import versions
 from stages.card_pool import Targets
+from stages.feeding import Feed
 from stages.ground import Ground
-from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
+from stages.ray_pool import PixelBatch
 
 REPORT_SECONDS = 0.5
-POOL_BYTES = 3 << 30  # of decoded images in memory
-POOL_STEPS = 250  # a pool that cannot hold all images is drawn anew this often (released code: about 280)
 PULSE_WIDTHS = (0.03, 0.003)  # of the blurred interlevel loss, coarse proposal first (released code)
 
 
-Advance = Callable[[int], dict[str, Tensor]]  # does a step; its losses by name
+Advance = Callable[[int], tuple[dict[str, Tensor], float]]  # does a step; its losses, and seconds waited so far
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,10 @@ class TileTraining:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Where the field lies (see `load_field`), and loss, psnr_db and rays_per_s of the end of training."""
+    """Where the field lies (see `load_field`), and figures of the end of training.
+
+    loss, psnr_db, rays_per_s, and waiting_share: of the time, how much was spent waiting for batches.
+    """
 
     folder: Path
     metrics: dict[str, float]
@@ -81,44 +84,40 @@ def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Re
     uninterrupted one would. Raises InputError if there is nothing to train on or an image cannot be
     read, BuildError if the loss stops being a number.
     """
+    from stages import card_training
+
     threads.use_threads(job.threads)
     threads.keep_freed_memory()
     rows = training_rows(job.frames, job.settings.training)
     if not len(rows):
         raise InputError(f"tile {job.tile_id}: none of its {len(job.frames)} frames is for training; ingest more")
-    run, advance = _start(job, source, rows, scratch)
+    run = card_training.CardRun(job, scratch, source, rows) if card_training.suits(job) else Run(job, scratch)
     if run.step < job.settings.training.steps:
         report(Progress("training", run.step, job.settings.training.steps))
-        with closing(run), _Log(job, scratch, report) as log:
+        with _steps(job, run, source, rows) as advance, _Log(job, scratch, report) as log:
             _train(job, run, advance, log)
     checkpoint.save_field(scratch / "field", run.field)
     return TrainingResult(scratch / "field", run.metrics)
 
 
-def _start(job: TileTraining, source: PixelSource, rows: NDArray[np.int64], scratch: Path) -> tuple["Run", Advance]:
-    """A run, and what takes it one step further: with a card by itself, else with rays drawn from pools."""
-    from stages import card_training
+@contextmanager
+def _steps(job: TileTraining, run: "Run", source: PixelSource, rows: NDArray[np.int64]) -> Iterator[Advance]:
+    """What takes a run one step further: a card draws its own rays, else a feed gives them."""
+    from stages.card_training import CardRun
 
-    if card_training.suits(job):
-        on_card = card_training.CardRun(job, scratch, source, rows)
-        return on_card, on_card.advance
-    run, settings = Run(job, scratch), job.settings
-    pools = _Pools(job, source, rows)
-
-    def advance(step: int) -> dict[str, Tensor]:
-        pool, groups = pools.at(step)
-        random = np.random.default_rng([settings.training.seed, step])
-        dynamic, thin_weight = settings.features.dynamic_classes, settings.training.thin_weight
-        return run.train(step, draw_static(pool, settings.training.batch_rays, groups, random, dynamic, thin_weight))
-
-    return run, advance
+    if isinstance(run, CardRun):
+        with closing(run):
+            yield lambda step: (run.advance(step), 0.0)
+    else:
+        with Feed(job, source, rows) as feed:
+            yield lambda step: (run.train(step, feed.batch(step)), feed.waited_s)
 
 
 def _train(job: TileTraining, run: "Run", advance: Advance, log: "_Log") -> None:
     """All steps that are left."""
     settings = job.settings.training
     for step in range(run.step, settings.steps):
-        log.add(step, advance(step))
+        log.add(step, *advance(step))
         if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
             log.flush(step)
             run.save(step + 1, log.figures)
@@ -172,41 +171,6 @@ def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.i
     """The rows in use, and which of them are held out."""
     rows = np.flatnonzero(frames.is_keyframe) if settings.keyframes_only else np.arange(len(frames))
     return rows, holdout_mask(frames.select(rows), settings.holdout_every)
-
-
-class _Pools:
-    """The pool of each step: all images if they fit into memory, else a random part that changes now and then."""
-
-    def __init__(self, job: TileTraining, source: PixelSource, rows: NDArray[np.int64]) -> None:
-        self._job, self._source, self._rows = job, source, rows
-        centroids = np.array([sub_field.centroid_m for sub_field in job.sub_fields])
-        offsets = job.frames.positions[rows][:, None] - centroids[None]
-        self._sub_field = np.linalg.norm(offsets, axis=-1).argmin(-1)
-        self._capacity = max(1, POOL_BYTES // bytes_of(source.load(int(rows[0]))))
-        self._epoch = -1
-
-    def at(self, step: int) -> tuple[RayPool, list[NDArray[np.int64]]]:
-        """The pool of a step, and its images grouped by sub-field."""
-        epoch = 0 if len(self._rows) <= self._capacity else step // POOL_STEPS
-        if epoch != self._epoch:
-            self._epoch = epoch
-            chosen = self._choose(epoch)
-            self._pool = RayPool(self._job.frames, self._source, self._rows[chosen], self._job.threads)
-            owner = self._sub_field[chosen]
-            self._groups = [np.flatnonzero(owner == sub_field) for sub_field in np.unique(owner)]
-        return self._pool, self._groups
-
-    def _choose(self, epoch: int) -> NDArray[np.int64]:
-        """Places in `rows` of the pool's images, as many of each sub-field as there is room for."""
-        if len(self._rows) <= self._capacity:
-            return np.arange(len(self._rows))
-        random = np.random.default_rng([self._job.settings.training.seed, epoch, 1])  # 1: apart from the steps'
-        order = random.permutation(len(self._rows))
-        rank = np.empty(len(order), np.int64)  # how many of its sub-field come before each
-        for sub_field in np.unique(self._sub_field):
-            places = np.flatnonzero(self._sub_field[order] == sub_field)
-            rank[places] = np.arange(len(places))
-        return np.sort(order[np.argsort(rank, kind="stable")[: self._capacity]])
 
 
 class Run:
@@ -278,9 +242,6 @@ class Run:
         self._optimiser.zero_grad()
         self.field.refresh_copies()
         return {name: part.detach() for name, part in parts.items()}
-
-    def close(self) -> None:
-        """Let go of what works in the background."""
 
     def save(self, step: int, figures: dict[str, float]) -> None:
         """Make the state after `step` steps durable."""
@@ -362,6 +323,7 @@ class _Log:
         self._writer = SummaryWriter(scratch / "tensorboard")
         self._sums: dict[str, Tensor] = {}
         self._steps = 0
+        self._waited_s = self._waited_before_s = 0.0  # for batches, in all; up to the last report
         self._started = time.perf_counter()
 
     def __enter__(self) -> "_Log":
@@ -370,8 +332,9 @@ class _Log:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
-    def add(self, step: int, parts: dict[str, Tensor]) -> None:
-        """Note a step's losses; every half second they are reported."""
+    def add(self, step: int, parts: dict[str, Tensor], waited_s: float) -> None:
+        """Note a step's losses, and how long all steps waited for batches; every half second they are reported."""
+        self._waited_s = waited_s
         for name, part in parts.items():
             self._sums[name] = self._sums.get(name, torch.zeros_like(part)) + part
         self._steps += 1
@@ -391,7 +354,13 @@ class _Log:
                 f"tile {self._job.tile_id}: the loss is {loss} at step {step}; lower training.learning_rate ({rate})"
             )
         rays_per_s = self._steps * self._job.settings.training.batch_rays / seconds
-        self.figures = {"loss": loss, "psnr_db": -10 * float(np.log10(means["rgb"])), "rays_per_s": rays_per_s}
+        self.figures = {
+            "loss": loss,
+            "psnr_db": -10 * float(np.log10(means["rgb"])),
+            "rays_per_s": rays_per_s,
+            "waiting_share": (self._waited_s - self._waited_before_s) / seconds,
+        }
+        self._waited_before_s = self._waited_s
         for name, value in {**{f"loss/{name}": mean for name, mean in means.items()}, **self.figures}.items():
             self._writer.add_scalar(name, value, step + 1)
         self._report(Progress("training", step + 1, self._job.settings.training.steps, dict(self.figures)))
