@@ -2,6 +2,8 @@
 
 import hashlib
 import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,12 +25,16 @@ from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import Recipe
 from presight_core.tiles import SubField
 from stages import versions
+from stages.card_pool import Targets
 from stages.feeding import Feed
-from stages.ground import Ground, Stretches
+from stages.ground import Ground
 from stages.ray_pool import PixelBatch
 
 REPORT_SECONDS = 0.5
 PULSE_WIDTHS = (0.03, 0.003)  # of the blurred interlevel loss, coarse proposal first (released code)
+
+
+Advance = Callable[[int], tuple[dict[str, Tensor], float]]  # does a step; its losses, and seconds waited so far
 
 
 @dataclass(frozen=True)
@@ -78,25 +84,40 @@ def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Re
     uninterrupted one would. Raises InputError if there is nothing to train on or an image cannot be
     read, BuildError if the loss stops being a number.
     """
+    from stages import card_training
+
     threads.use_threads(job.threads)
     threads.keep_freed_memory()
     rows = training_rows(job.frames, job.settings.training)
     if not len(rows):
         raise InputError(f"tile {job.tile_id}: none of its {len(job.frames)} frames is for training; ingest more")
-    run = Run(job, scratch)
+    run = card_training.CardRun(job, scratch, source, rows) if card_training.suits(job) else Run(job, scratch)
     if run.step < job.settings.training.steps:
         report(Progress("training", run.step, job.settings.training.steps))
-        with _Log(job, scratch, report) as log, Feed(job, source, rows) as feed:
-            _train(job, run, feed, log)
+        with _steps(job, run, source, rows) as advance, _Log(job, scratch, report) as log:
+            _train(job, run, advance, log)
     checkpoint.save_field(scratch / "field", run.field)
     return TrainingResult(scratch / "field", run.metrics)
 
 
-def _train(job: TileTraining, run: "Run", feed: Feed, log: "_Log") -> None:
+@contextmanager
+def _steps(job: TileTraining, run: "Run", source: PixelSource, rows: NDArray[np.int64]) -> Iterator[Advance]:
+    """What takes a run one step further: a card draws its own rays, else a feed gives them."""
+    from stages.card_training import CardRun
+
+    if isinstance(run, CardRun):
+        with closing(run):
+            yield lambda step: (run.advance(step), 0.0)
+    else:
+        with Feed(job, source, rows) as feed:
+            yield lambda step: (run.train(step, feed.batch(step)), feed.waited_s)
+
+
+def _train(job: TileTraining, run: "Run", advance: Advance, log: "_Log") -> None:
     """All steps that are left."""
     settings = job.settings.training
     for step in range(run.step, settings.steps):
-        log.add(step, run.train(step, feed.batch(step)), feed.waited_s)
+        log.add(step, *advance(step))
         if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
             log.flush(step)
             run.save(step + 1, log.figures)
@@ -177,18 +198,49 @@ class Run:
         """One step of the optimiser; its losses by name."""
         for group in self._optimiser.param_groups:
             group["lr"] = schedule.learning_rate(step, self._settings)
+        jitter = self._random(step, len(batch.rows), self.passes)
+        exponent, trains_proposals = self._schedule(step)
+        targets = Targets(
+            *(torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.labels, batch.features))
+        )
+        sampling = Sampling(jitter, exponent, trains_proposals)
+        if self._ground is None:
+            return self._descend(self._rays(batch), targets, sampling)
+        start_m, end_m = (torch.from_numpy(value).to(self._job.device) for value in self._ground.stretches(batch))
+        return self._descend(replace(self._rays(batch), ends_m=end_m), targets, sampling, start_m)
+
+    @property
+    def passes(self) -> int:
+        """How often samples are placed along a ray."""
+        return len(self._job.settings.sampling.proposal_samples) + 1
+
+    def _random(self, step: int, *size: int) -> Tensor:
+        """Uniform random numbers of a step."""
         # Torch's seed must depend on both: consecutive seeds of the same run never meet those of another.
         self._generator.manual_seed(self._settings.seed << 32 | step)
-        trains_proposals = schedule.trains_proposals(step, self._settings)
-        sampling = Sampling(self._generator, schedule.anneal_exponent(step, self._settings), trains_proposals)
-        stretches = self._ground.stretches(batch) if self._ground else None
-        rendering = self.field(self._rays(batch, stretches), sampling)
-        parts = self._losses(rendering, batch, trains_proposals)
-        if stretches:
-            parts["ground"] = self._settings.ground.weight * self._ground_loss(rendering, stretches)
+        return torch.rand(*size, generator=self._generator, device=self._job.device)
+
+    def _schedule(self, step: int) -> tuple[float, bool]:
+        """The exponent of the proposals' weights, and whether the proposals learn."""
+        return schedule.anneal_exponent(step, self._settings), schedule.trains_proposals(step, self._settings)
+
+    def _descend(
+        self, rays: Rays, targets: Targets, sampling: Sampling, starts_m: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """One step of the optimiser; its losses by name. On a card nothing here may wait for it: see CardRun.
+
+        Where rays show the ground they must not end before `starts_m` (R,), metres; 0: nothing is known.
+        """
+        rendering = self.field(rays, sampling)
+        parts = self._losses(rendering, targets, sampling.train_proposals)
+        if starts_m is not None:
+            middles_m = (rendering.edges_m[:, 1:] + rendering.edges_m[:, :-1]) / 2
+            ground = losses.ground_loss(rendering.field.weights, middles_m, starts_m)
+            parts["ground"] = self._settings.ground.weight * ground
         torch.stack(list(parts.values())).sum().backward()
         self._optimiser.step()
         self._optimiser.zero_grad()
+        self.field.refresh_copies()
         return {name: part.detach() for name, part in parts.items()}
 
     def save(self, step: int, figures: dict[str, float]) -> None:
@@ -219,27 +271,18 @@ class Run:
         for name, parameter in self.field.named_parameters():
             self._optimiser.state[parameter] = {quantity: values[name] for quantity, values in state.items()}
 
-    def _rays(self, batch: PixelBatch, stretches: Stretches | None) -> Rays:
+    def _rays(self, batch: PixelBatch) -> Rays:
         videos, images = self._videos[batch.rows], self._images[batch.rows]
-        rays = self.field.rays(batch.origins_world, batch.directions_world, videos, images)
-        return replace(rays, ends_m=torch.from_numpy(stretches.end_m).to(self._job.device)) if stretches else rays
+        return self.field.rays(batch.origins_world, batch.directions_world, videos, images)
 
-    def _ground_loss(self, rendering: Rendering, stretches: Stretches) -> Tensor:
-        middles_m = (rendering.edges_m[:, 1:] + rendering.edges_m[:, :-1]) / 2
-        start_m = torch.from_numpy(stretches.start_m).to(self._job.device)
-        return losses.ground_loss(rendering.field.weights, middles_m, start_m)
-
-    def _losses(self, rendering: Rendering, batch: PixelBatch, trains_proposals: bool) -> dict[str, Tensor]:
+    def _losses(self, rendering: Rendering, targets: Targets, trains_proposals: bool) -> dict[str, Tensor]:
         """The five losses (paper, section 3.2), weighted."""
-        weights = self._settings.loss
-        rgb, features, labels = (
-            torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.features, batch.labels)
-        )
-        known = labels != classes.UNKNOWN
+        weights, labels = self._settings.loss, targets.labels
+        sky = losses.sky_loss(rendering.accumulation, labels == classes.SKY, labels != classes.UNKNOWN)
         parts = {
-            "rgb": functional.mse_loss(rendering.rgb, rgb / 255),
-            "features": weights.features * losses.feature_loss(rendering.features, features / 255),
-            "sky": weights.sky * losses.sky_loss(rendering.accumulation[known], labels[known] == classes.SKY),
+            "rgb": functional.mse_loss(rendering.rgb, targets.rgb / 255),
+            "features": weights.features * losses.feature_loss(rendering.features, targets.features / 255),
+            "sky": weights.sky * sky,
             "distortion": weights.distortion * losses.distortion_loss(rendering.field.edges, rendering.field.weights),
         }
         if trains_proposals:

@@ -4,5 +4,6 @@ A raised number makes every tile built with the old one stale.
 """
 
 FEATURES = 2
-TRAINING = 2
+TRAINING = 3
+EXTRACTION = 2
 EXTRACTION = 2

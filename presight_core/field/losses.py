@@ -17,11 +17,18 @@ def feature_loss(rendered: Tensor, target: Tensor) -> Tensor:
     return functional.mse_loss(rendered, target.clamp(0, 1))
 
 
-def sky_loss(accumulation: Float[Tensor, " rays"], is_sky: Bool[Tensor, " rays"]) -> Tensor:
-    """Binary cross-entropy: rays of the sky should end nowhere, all others somewhere."""
+def sky_loss(
+    accumulation: Float[Tensor, " rays"], is_sky: Bool[Tensor, " rays"], is_known: Bool[Tensor, " rays"] | None = None
+) -> Tensor:
+    """Binary cross-entropy: rays of the sky should end nowhere, all others somewhere.
+
+    The mean over rays whose label `is_known`; 0 if none is. A product, because picking rays out would make shapes
+    depend on values.
+    """
     # The bound of half a float32 step below 1 keeps both logarithms finite.
     bounded = accumulation.clamp(1e-7, 1 - 1e-7)
-    return -torch.where(is_sky, 1 - bounded, bounded).log().mean()
+    entropy = -torch.where(is_sky, 1 - bounded, bounded).log()
+    return entropy.mean() if is_known is None else (entropy * is_known).sum() / is_known.sum().clamp_min(1)
 
 
 def ground_loss(

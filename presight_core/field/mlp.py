@@ -43,9 +43,13 @@ class SubFieldMlp(nn.Module):
             layers = [layer for pair in zip(self.weights, self.biases, strict=True) for layer in pair]
             result: Tensor = SubFieldLayers.apply(inputs, assignment.segments, self.dtype, *layers)  # type: ignore[assignment]
             return result[:, :outputs]
+        return self.blockwise(inputs, assignment.bounds, outputs)
+
+    def blockwise(self, inputs: Tensor, segments: Sequence[int], outputs: int | None = None) -> Tensor:
+        """As `forward`, one sub-field after the other: rows segments[s]..segments[s + 1] go through sub-field s."""
         last = slice(outputs)
         parameters = (*self.weights[:-1], self.weights[-1][:, last], *self.biases[:-1], self.biases[-1][:, last])
-        return _BlockwiseLayers.apply(inputs, assignment.bounds, self.dtype, torch.is_grad_enabled(), *parameters)  # type: ignore[return-value]
+        return _BlockwiseLayers.apply(inputs, segments, self.dtype, torch.is_grad_enabled(), *parameters)  # type: ignore[return-value]
 
     def _is_fused(self, inputs: Tensor) -> bool:
         """Whether one kernel takes all sub-fields: on a card, in a half type; or under Triton's interpreter."""

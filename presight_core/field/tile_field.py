@@ -70,8 +70,8 @@ class Histogram:
 class Sampling:
     """How samples are placed in one pass. The default is that of evaluation: nothing random."""
 
-    generator: torch.Generator | None = None  # None: no jitter
-    anneal: float = 1.0  # exponent of the proposals' weights; below 1 they are flattened
+    jitter: Float[Tensor, "rays passes"] | None = None  # in [0, 1), a column for each proposal and the field; or none
+    anneal: float | Tensor = 1.0  # exponent of the proposals' weights; below 1 they are flattened
     train_proposals: bool = False
     left: float = 0.0  # a ray is followed until this share of it is left; the proposals' samples beyond weigh nothing
 
@@ -159,6 +159,18 @@ class TileField(nn.Module):
             if isinstance(module, SubFieldMlp):
                 module.dtype = dtype
 
+    def use_copies(self, dtype: torch.dtype) -> None:
+        """Let the hash grids read rounded copies of their tables; after each step `refresh_copies` renews them."""
+        for module in self.modules():
+            if isinstance(module, HashGrid):
+                module.copy = module.table.detach().to(dtype)
+
+    def refresh_copies(self) -> None:
+        """Round the tables again, where there are copies."""
+        for module in self.modules():
+            if isinstance(module, HashGrid) and module.copy is not None:
+                module.copy.copy_(module.table.detach())
+
     def rays(
         self,
         origins_world: NDArray[np.float64],
@@ -205,7 +217,8 @@ class TileField(nn.Module):
         if settings.floor_m is not None:
             far_m = samplers.far_above_floor(rays.directions, far_m, settings.floor_m, settings.floor_slope)
         if rays.ends_m is not None:
-            far_m = torch.minimum(rays.ends_m[:, None], torch.as_tensor(far_m, device=rays.ends_m.device))
+            ends_m = rays.ends_m[:, None]
+            far_m = torch.minimum(ends_m, far_m) if isinstance(far_m, Tensor) else ends_m.clamp_max(far_m)
         return samplers.Spacing(settings.near_m, far_m, settings.linear_m)
 
     def place_samples(
@@ -213,16 +226,16 @@ class TileField(nn.Module):
     ) -> tuple[tuple[Histogram, ...], Float[Tensor, "rays edges"]]:
         """Histograms of the proposals, and the edges (in s) of the samples that they ask for."""
         counts = (*self.shape.sampling.proposal_samples, self.shape.sampling.field_samples)
-        edges = samplers.uniform_edges(len(rays.origins), counts[0], self._jitter(rays, sampling), rays.origins)
+        jitter = [None] * len(counts) if sampling.jitter is None else sampling.jitter.split(1, -1)
+        edges = samplers.uniform_edges(len(rays.origins), counts[0], jitter[0], rays.origins)
         histograms, spacing = [], self.spacing(rays)
-        for proposal, count in zip(self.proposals, counts[1:], strict=True):
+        for number, (proposal, count) in enumerate(zip(self.proposals, counts[1:], strict=True), 1):
             edges_m = spacing.metres(edges)
             with torch.set_grad_enabled(sampling.train_proposals and torch.is_grad_enabled()):
                 weights = self._weights(proposal, rays, edges_m, sampling.left)
             histograms.append(Histogram(edges, weights))
             flattened = weights.detach() ** sampling.anneal
-            jitter, padding = self._jitter(rays, sampling), self.shape.sampling.padding
-            edges = samplers.resample(edges, flattened, count, jitter, padding)
+            edges = samplers.resample(edges, flattened, count, jitter[number], self.shape.sampling.padding)
         return tuple(histograms), edges
 
     def query(self, points: Float[Tensor, "rays samples 3"], conditions: Float[Tensor, "rays _"]) -> PointValues:
@@ -261,7 +274,9 @@ class TileField(nn.Module):
     def conditions(self, rays: Rays) -> Float[Tensor, "rays _"]:
         """What colour depends on beside the place: direction, video and image."""
         embeddings = [
-            table.weight.mean(0).expand(len(rays.origins), -1) if numbers is None else table(numbers)
+            table.weight.mean(0).expand(len(rays.origins), -1)
+            if numbers is None
+            else table.weight.index_select(0, numbers)
             for table, numbers in ((self.video_embedding, rays.videos), (self.image_embedding, rays.images))
         ]
         return torch.cat([spherical_harmonics(rays.directions), *embeddings], -1)
@@ -299,9 +314,3 @@ class TileField(nn.Module):
         rgb = torch.sigmoid(self.sky_colour(seen, assignment).float())
         features = self.sky_features(seen[:, :HARMONICS], assignment).float()
         return assignment.restore(rgb), assignment.restore(features)
-
-    def _jitter(self, rays: Rays, sampling: Sampling) -> Tensor | None:
-        if sampling.generator is None:
-            return None
-        device = rays.origins.device
-        return torch.rand(len(rays.origins), 1, generator=sampling.generator, device=device)

@@ -161,6 +161,14 @@ def test_sky_loss_is_small_when_only_the_sky_is_empty():
     assert losses.sky_loss(right, is_sky) < 0.02 < losses.sky_loss(wrong, is_sky)
 
 
+def test_sky_loss_passes_over_rays_without_a_label():
+    accumulation, is_sky = torch.rand(6), torch.tensor([True, False, True, False, True, False])
+    is_known = torch.tensor([True, True, False, False, True, False])
+    expected = losses.sky_loss(accumulation[is_known], is_sky[is_known])
+    torch.testing.assert_close(losses.sky_loss(accumulation, is_sky, is_known), expected)
+    assert losses.sky_loss(accumulation, is_sky, torch.zeros(6, dtype=torch.bool)) == 0
+
+
 def test_learning_rate_rises_then_drops():
     settings = TrainingSettings(steps=100, learning_rate=1.0, warmup=0.1, decay_at=(0.5,), decay=0.33)
     rates = [schedule.learning_rate(step, settings) for step in (0, 10, 49, 50)]

@@ -84,11 +84,24 @@ def test_every_parameter_learns():
     origins, directions = random_rays(64)
     numbers = np.arange(64)
     rays = field.rays(origins, directions, numbers % 3, numbers % 4)
-    seen = field(rays, Sampling(torch.Generator().manual_seed(0), 1.0, train_proposals=True))
+    seen = field(rays, Sampling(torch.rand(64, 3), 1.0, train_proposals=True))
     loss = seen.rgb.sum() + seen.features.sum() + sum(proposal.weights.square().sum() for proposal in seen.proposals)
     loss.backward()
     idle = [name for name, parameter in field.named_parameters() if parameter.grad is None or not parameter.grad.any()]
     assert idle == []
+
+
+def test_copies_of_tables_are_read_and_follow_the_tables():
+    field, rays = small_field(), random_rays(5)
+    exact = field(field.rays(*rays)).rgb
+    field.use_copies(torch.bfloat16)
+    torch.testing.assert_close(field(field.rays(*rays)).rgb, exact, atol=1e-3, rtol=0)
+    with torch.no_grad():
+        field.trunk.grid.table.normal_()
+    torch.testing.assert_close(field(field.rays(*rays)).rgb, exact, atol=1e-3, rtol=0)
+    field.refresh_copies()
+    assert float((field(field.rays(*rays)).rgb - exact).detach().abs().max()) > 0.003
+    assert not any("copy" in name for name in field.state_dict())
 
 
 def test_sky_features_ignore_the_video():
@@ -114,7 +127,7 @@ def test_evaluation_is_repeatable_and_training_is_jittered():
     field = small_field()
     rays = field.rays(*random_rays(3))
     assert torch.equal(field(rays).edges_m, field(rays).edges_m)
-    assert not torch.equal(field(rays).edges_m, field(rays, Sampling(torch.Generator())).edges_m)
+    assert not torch.equal(field(rays).edges_m, field(rays, Sampling(torch.rand(3, 3))).edges_m)
 
 
 def test_a_saved_field_renders_the_same(tmp_path):

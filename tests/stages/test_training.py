@@ -3,7 +3,6 @@ import pytest
 import torch
 
 from presight_core import classes
-from presight_core.config import CitySettings, load_city_settings
 from presight_core.drives import FrameTable
 from presight_core.errors import BuildError, InputError
 from presight_core.field.checkpoint import load_field
@@ -15,14 +14,10 @@ from stages import feeding
 from stages.evaluation import evaluate_tile
 from stages.ray_pool import RayPool, draw_static
 from stages.training import TileTraining, holdout_mask, image_numbers, train_tile, training_rows
+from tests.stages.small_training import tiny_settings
 
 EGO_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
 SIZE = (24, 16)
-TINY = (
-    "training.steps=12", "training.batch_rays=64", "training.checkpoint_every=6", "training.holdout_every=4",
-    "field.hidden_width=8", "field.proposal_width=8", "field.grid.log2_rows=8", "field.grid.max_resolution=64",
-    "field.grid.levels=3", "sampling.proposal_samples=[12, 8]", "sampling.field_samples=8",
-)  # fmt: skip
 
 
 class Gradient:
@@ -55,10 +50,6 @@ def street(count: int = 8, drives: int = 1) -> FrameTable:
         world_from_camera=poses,
         is_keyframe=np.arange(count) % 2 == 0,
     )
-
-
-def tiny_settings(*overrides: str) -> CitySettings:
-    return load_city_settings(None, ["preset=demo", *TINY, *overrides])
 
 
 def tiny_job(*overrides: str, frames: FrameTable | None = None) -> TileTraining:
