@@ -7,7 +7,9 @@ from typing import Annotated, NoReturn
 import typer
 
 from flows import store_commands
-from flows.options import AsJson, City
+from flows.feature_commands import features
+from flows.model_commands import models
+from flows.options import AsJson, City, Overrides
 from presight_core.errors import MissingDependencyError, PresightError, StoreError
 
 app = typer.Typer(
@@ -18,13 +20,11 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+app.add_typer(features, name="features")
+app.add_typer(models, name="models")
 catalog_commands = typer.Typer(help="Look after the catalog.", no_args_is_help=True)
 app.add_typer(catalog_commands, name="catalog")
 
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, for example training.steps=2000."),
-]
 Shown = Annotated[int | None, typer.Option("--generation", help="Generation to read; the newest if not given.")]
 
 

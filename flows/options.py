@@ -8,3 +8,7 @@ City = Annotated[
     str, typer.Argument(help="City: the log location, for example singapore-onenorth.", show_default=False)
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, for example training.steps=2000."),
+]

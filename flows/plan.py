@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from flows.console import print_json, print_table
+from presight_core import masking
 from presight_core.config import CitySettings, load_city_settings
 from presight_core.drives import Drive, FrameTable
 from presight_core.errors import NotFoundError
@@ -80,7 +81,7 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
         )
     frames = city_frames(workspace.drives(), drives, settings)
     city_tiling = _tiling(catalog.tiling(city), city, frames, settings)
-    space_id = workspace.artifacts().pinned_space(space_key(settings))
+    space_id = settings.features.space or workspace.artifacts().pinned_space(space_key(settings))
     features = features_recipe(settings, space_id) if space_id else None
     generation = workspace.store().generation(city)
     past = {build.tile_id: build for build in catalog.builds(city)}
@@ -130,7 +131,9 @@ def features_recipe(settings: CitySettings, space_id: str) -> Recipe:
         "feature_model": ModelCard.load(settings.features.feature_model, "features").identity,
         "space": space_id,
     }
-    chosen = {"masks": settings.features.masks, "keyframes_only": settings.training.keyframes_only}
+    features = settings.features
+    chosen = {"masks": features.masks, "cache": features.cache, "parked_cars": features.parked_cars}
+    chosen |= {"keyframes_only": settings.training.keyframes_only}
     return Recipe("features", versions.FEATURES, chosen, models)
 
 
@@ -153,6 +156,7 @@ def _recipes(
         "drives": np.unique(members.drive_id).tolist(),
         "features": features.to_json(),
         "dynamic_classes": list(settings.features.dynamic_classes),
+        "moving": masking.recipe(settings.features),
         "tile": city_tiling.tiles[tile].tile_id,
         "centroid_m": list(city_tiling.tiles[tile].centroid_m),
     }
