@@ -110,7 +110,7 @@ def export(
     context: typer.Context,
     city: City,
     out: Annotated[Path, typer.Option(help="Folder to write into.", show_default=False)],
-    layout: Annotated[Layout, typer.Option(help="Form of the export; docs/exports.md.")] = Layout.NPY,
+    layout: Annotated[Layout, typer.Option(help="Form of the export; docs/store.md.")] = Layout.NPY,
     generation: Generation = None,
 ) -> None:
     """Write a city's priors in a form that other programs read."""

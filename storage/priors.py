@@ -155,8 +155,11 @@ class PriorStore:
     def tag(self, city: str, tag: str, number: int | None = None) -> int:
         """Name a generation, the newest if not given, for good: readers may ask for it, and nothing of it is deleted.
 
-        Its number. Raises ConflictError if the tag stands for another one, NotFoundError without such a generation.
+        Its number. Raises ConflictError if the tag stands for another one, NotFoundError without such a generation,
+        InputError for a tag of digits, which would be taken for a generation's number.
         """
+        if tag.isdigit():
+            raise InputError(f"{city}: tag {tag} reads like a generation; use a name such as release-{tag}")
         generation = read_generation(self._source, city, number)
         self.save_document(city, "tags", tag, {"generation": generation.number})
         return generation.number

@@ -62,7 +62,9 @@ class ReadLocation:
             if isinstance(self._place, Path):
                 return sorted(entry.name for entry in (self._place / folder).iterdir() if entry.is_file())
             objects = obstore.list_with_delimiter(self._place, folder)["objects"]
-            return sorted(entry["path"].rpartition("/")[2] for entry in objects)
+            # Some servers list a folder that was emptied as an object of the folder's own name.
+            paths = [entry["path"] for entry in objects if entry["path"].startswith(f"{folder}/")]
+            return sorted(path.rpartition("/")[2] for path in paths)
         except FileNotFoundError:
             return []
         except (OSError, BaseError) as error:

@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from presight_core.errors import NotFoundError, StoreError
+from presight_core.errors import InputError, NotFoundError, StoreError
 from presight_core.priors import PriorReader
 from storage.retention import Retention, collect, find_garbage
 from storage.verification import verify_city
@@ -109,6 +109,8 @@ def test_tags_are_listed_set_once_and_taken_away(rebuilt):
     assert rebuilt.store.tags("town") == {"release": 3}
     with pytest.raises(Exception, match="other content"):
         rebuilt.store.tag("town", "release", 2)
+    with pytest.raises(InputError, match="reads like a generation"):
+        rebuilt.store.tag("town", "7")
     rebuilt.store.remove_tag("town", "release")
     assert rebuilt.store.tags("town") == {}
     with pytest.raises(NotFoundError):
