@@ -4,7 +4,7 @@ PYTHON ?= python3.11
 TORCH ?= torch==2.13.0
 BIN = .venv/bin
 
-.PHONY: install demo test check lint clean
+.PHONY: install demo test torture check lint clean
 
 install: .venv/.installed
 
@@ -19,6 +19,10 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest
+
+# Faults by the thousand: hours. What `make test` injects is the short form of it.
+torture: install
+	PRESIGHT_TORTURE=1 $(BIN)/python -m pytest --timeout 0 tests/torture
 
 check: lint
 	$(BIN)/python -m pytest -m "not slow"

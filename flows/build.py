@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 
 from flows.console import print_json
 from flows.plan import CityPlan, plan_city
+from flows.reconcile import reconcile
 from presight_core.config import load_city_settings
 from presight_core.errors import BuildError
 from storage.workspace import Workspace
@@ -22,13 +23,21 @@ PREFECT_ENVIRONMENT = {
 }
 
 
-def build_city(folder: Path, city: str, overrides: list[str], parallel: int | None, as_json: bool) -> None:
-    """Build what is stale of a city and say what became of it. Raises BuildError if a tile failed."""
+def build_city(
+    folder: Path, city: str, overrides: list[str], parallel: int | None, as_json: bool, wait: bool = False
+) -> None:
+    """Build what is stale of a city and say what became of it.
+
+    Raises BuildError if a tile failed, LeaseHeldError if another run builds the city and this one shall not wait.
+    """
     started = time.monotonic()
     workspace = Workspace.open(folder).require()
+    reconcile(workspace, city)
     plan = plan_city(workspace, city, load_city_settings(workspace.city_file(city), overrides))
     if plan.stale:
-        outcome = _run(workspace, plan, overrides, parallel)
+        if not wait:
+            workspace.catalog().leases.require_free(city)  # said now, not after the flow took its time to start
+        outcome = _run(workspace, plan, overrides, parallel, wait)
     else:
         outcome = {"generation": plan.generation, "published": [], "failed": {}}
     outcome["seconds"] = round(time.monotonic() - started, 1)
@@ -42,7 +51,9 @@ def build_city(folder: Path, city: str, overrides: list[str], parallel: int | No
         )
 
 
-def _run(workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None) -> dict[str, Any]:
+def _run(
+    workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None, wait: bool
+) -> dict[str, Any]:
     for name, value in PREFECT_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     from flows.city import run_city
@@ -51,7 +62,7 @@ def _run(workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: i
     signal.signal(signal.SIGTERM, _exit)  # so that Prefect's embedded server ends with us
     print(f"{plan.city}: starting the flow", file=sys.stderr)
     with watch_builds(workspace.catalog(), plan.city):
-        return run_city(workspace, plan, overrides, parallel)
+        return run_city(workspace, plan, overrides, parallel, wait)
 
 
 def _exit(number: int, _frame: Any) -> NoReturn:

@@ -12,8 +12,11 @@ from flows import tasks
 from flows.jobs import Job
 from flows.plan import CityPlan, plan_city
 from flows.publication import Built, publish
+from flows.reconcile import hold_city
 from presight_core.config import load_city_settings
 from presight_core.recipes import Recipe
+from storage.leases import Lease
+from storage.restoration import remember_tiling
 from storage.workspace import Workspace
 
 CITY_ROW = "all tiles"  # the catalog's row of what belongs to no tile: the feature space and the features
@@ -21,24 +24,35 @@ CITY_ROW = "all tiles"  # the catalog's row of what belongs to no tile: the feat
 
 @flow(name="rebuild_city", flow_run_name="rebuild {city}", persist_result=False)
 def rebuild_city(
-    workspace: str, city: str, overrides: list[str] | None = None, threads: int = 1, devices: list[str] | None = None
+    workspace: str,
+    city: str,
+    overrides: list[str] | None = None,
+    threads: int = 1,
+    devices: list[str] | None = None,
+    wait: bool = False,
 ) -> dict[str, Any]:
-    """Build and publish what is stale. A tile that fails keeps its old build and is named in the result."""
+    """Build and publish what is stale. A tile that fails keeps its old build and is named in the result.
+
+    While another run builds the city this one waits, or raises LeaseHeldError.
+    """
     opened = Workspace.open(Path(workspace))
     settings = load_city_settings(opened.city_file(city), overrides or ())
-    plan = plan_city(opened, city, settings)
-    if plan.stale and plan.space_id is None:
-        _fit_space(opened, plan, threads)
+    with hold_city(opened, city, wait) as lease:
         plan = plan_city(opened, city, settings)
-    if not plan.stale:
-        return {"generation": plan.generation, "published": [], "failed": {}}
-    _freeze(opened, plan)
-    broken = _extract_features(opened, plan, threads)
-    built, failed = _build_tiles(_tile_jobs(opened, plan, threads, devices or ["cpu"]), broken)
-    return publish(opened, plan, built, failed)
+        if plan.stale and plan.space_id is None:
+            _fit_space(opened, plan, threads, lease)
+            plan = plan_city(opened, city, settings)
+        if not plan.stale:
+            return {"generation": plan.generation, "published": [], "failed": {}}
+        freeze(opened, plan, lease)
+        broken = _extract_features(opened, plan, threads, lease)
+        built, failed = _build_tiles(tile_jobs(opened, plan, threads, devices or ["cpu"], lease), broken)
+        return publish(opened, plan, built, failed, lease)
 
 
-def run_city(workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None) -> dict[str, Any]:
+def run_city(
+    workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None, wait: bool = False
+) -> dict[str, Any]:
     """Run the flow on this machine, as many tiles at once as it has GPUs, or else cores."""
     devices = available_devices()
     cores = len(os.sched_getaffinity(0))
@@ -46,7 +60,7 @@ def run_city(workspace: Workspace, plan: CityPlan, overrides: list[str], paralle
     at_once = max(1, min(wanted, len(plan.stale)))
     runner: Any = ThreadPoolTaskRunner(max_workers=at_once)  # Prefect's own types do not fit each other here
     run = rebuild_city.with_options(task_runner=runner)
-    return run(str(workspace.root), plan.city, overrides, max(1, cores // at_once), devices)
+    return run(str(workspace.root), plan.city, overrides, max(1, cores // at_once), devices, wait)
 
 
 def available_devices() -> list[str]:
@@ -56,18 +70,22 @@ def available_devices() -> list[str]:
     return [f"cuda:{index}" for index in range(torch.cuda.device_count())] or ["cpu"]
 
 
-def _freeze(workspace: Workspace, plan: CityPlan) -> None:
+def freeze(workspace: Workspace, plan: CityPlan, lease: Lease) -> None:
     """Fix what every later build of the city must share: its tiling, its lattice and its feature space."""
     assert plan.space_id is not None
     workspace.catalog().save_tiling(plan.tiling, plan.settings.tiling.model_dump(mode="json"))
     channels = workspace.artifacts().space(plan.space_id).channel_count
     workspace.store().create_city(plan.city, plan.lattice, plan.space_id, channels)
+    remember_tiling(workspace.store(), workspace.catalog(), plan.tiling)
+    if lease.follows_lost:  # when the lease was taken the store may not have known the city
+        workspace.store().raise_fence(plan.city, lease.token)
 
 
-def _fit_space(workspace: Workspace, plan: CityPlan, threads: int) -> None:
+def _fit_space(workspace: Workspace, plan: CityPlan, threads: int, lease: Lease) -> None:
     catalog = workspace.catalog()
     drive_ids = tuple(drive.drive_id for drive in plan.drives)
-    build_id = catalog.start_build(plan.city, CITY_ROW, Recipe("space", 1, {}, {"drives": list(drive_ids)}))
+    recipe = Recipe("space", 1, {}, {"drives": list(drive_ids)})
+    build_id = catalog.start_build(plan.city, CITY_ROW, recipe, lease)
     try:
         tasks.fit_space(replace(_job(workspace, plan, build_id, threads), drive_ids=drive_ids))
     except Exception as error:
@@ -76,7 +94,7 @@ def _fit_space(workspace: Workspace, plan: CityPlan, threads: int) -> None:
     catalog.finish_build(build_id, "built", {})
 
 
-def _extract_features(workspace: Workspace, plan: CityPlan, threads: int) -> dict[str, str]:
+def _extract_features(workspace: Workspace, plan: CityPlan, threads: int, lease: Lease) -> dict[str, str]:
     """Features of every drive that a stale tile needs; the error of each drive that has none, by drive id."""
     assert plan.features is not None
     cache, catalog = workspace.features(), workspace.catalog()
@@ -84,7 +102,7 @@ def _extract_features(workspace: Workspace, plan: CityPlan, threads: int) -> dic
     missing = [drive_id for drive_id in needed if not cache.is_complete(plan.features.digest, drive_id)]
     if not missing:
         return {}
-    build_id = catalog.start_build(plan.city, CITY_ROW, plan.features)
+    build_id = catalog.start_build(plan.city, CITY_ROW, plan.features, lease)
     job = _job(workspace, plan, build_id, threads)
     broken: dict[str, str] = {}
     for drive_id in missing:  # one after the other: a session uses all threads, and the disk is the limit
@@ -95,13 +113,13 @@ def _extract_features(workspace: Workspace, plan: CityPlan, threads: int) -> dic
     return broken
 
 
-def _tile_jobs(workspace: Workspace, plan: CityPlan, threads: int, devices: list[str]) -> dict[str, Job]:
+def tile_jobs(workspace: Workspace, plan: CityPlan, threads: int, devices: list[str], lease: Lease) -> dict[str, Job]:
     """A job for every stale tile, each with a row in the catalog."""
     jobs = {}
     for index, tile in enumerate(plan.stale):
         assert tile.recipe is not None
         assert tile.training is not None
-        build_id = workspace.catalog().start_build(plan.city, tile.tile_id, tile.recipe)
+        build_id = workspace.catalog().start_build(plan.city, tile.tile_id, tile.recipe, lease)
         jobs[tile.tile_id] = replace(
             _job(workspace, plan, build_id, threads),
             device=devices[index % len(devices)],

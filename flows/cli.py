@@ -8,7 +8,7 @@ import typer
 
 from flows.feature_commands import features
 from flows.model_commands import models
-from presight_core.errors import MissingDependencyError, PresightError
+from presight_core.errors import MissingDependencyError, PresightError, StoreError
 
 app = typer.Typer(
     help="Turn the camera logs of past drives into a city's neural prior.",
@@ -20,6 +20,8 @@ app = typer.Typer(
 
 app.add_typer(features, name="features")
 app.add_typer(models, name="models")
+catalog_commands = typer.Typer(help="Look after the catalog.", no_args_is_help=True)
+app.add_typer(catalog_commands, name="catalog")
 
 City = Annotated[
     str, typer.Argument(help="City: the log location, for example singapore-onenorth.", show_default=False)
@@ -84,12 +86,35 @@ def build(
     parallel: Annotated[
         int | None, typer.Option(min=1, help="Tiles at once; as many as GPUs, or else cores, if not given.")
     ] = None,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait while another run builds the city, rather than refuse.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Build and publish what is stale of a city: features, training, extraction, validation."""
     from flows.build import build_city
 
-    build_city(context.obj, city, override or [], parallel, as_json)
+    build_city(context.obj, city, override or [], parallel, as_json, wait)
+
+
+@catalog_commands.command("rebuild")
+def rebuild_catalog(context: typer.Context, as_json: AsJson = False) -> None:
+    """Make a lost catalog again, from the store and the index of drives."""
+    from flows.reconcile import rebuild
+
+    rebuild(context.obj, as_json)
+
+
+@app.command()
+def reconcile(
+    context: typer.Context,
+    city: Annotated[str | None, typer.Argument(help="City; all cities if not given.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find runs that died, and end what they left as running in the catalog."""
+    from flows.reconcile import show_reconciled
+
+    show_reconciled(context.obj, city, as_json)
 
 
 @app.command()
@@ -176,6 +201,8 @@ def main() -> None:
         app()
     except PresightError as error:
         _fail(error)
+    except OSError as error:
+        _fail(StoreError(f"{error}; check the disk's space and your access to it, then run again"))
     except ModuleNotFoundError as error:
         cure = "this command needs the whole pipeline: pip install '.[pipeline]' (README, Install)"
         _fail(MissingDependencyError(f"{error}; {cure}"))

@@ -34,8 +34,8 @@ def ingest_root(
     catalog, index = workspace.catalog(), workspace.drives()
     rows = []
     for ingested in usable:
-        index.add(ingested.drive, ingested.frames, ingested.rejects)
-        is_new = catalog.add_drive(ingested.drive, ingested.rejects)
+        added_at = index.add(ingested.drive, ingested.frames, ingested.rejects, catalog.now())
+        is_new = catalog.add_drive(ingested.drive, ingested.rejects, added_at)
         rows.append({**asdict(ingested.drive), "new": is_new, "rejects": [asdict(r) for r in ingested.rejects]})
     if as_json:
         print_json({"workspace": str(workspace.root), "drives": rows, "left_out": len(drives) - len(usable)})

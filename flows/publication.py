@@ -6,9 +6,12 @@ from typing import Any
 
 from flows.jobs import Job
 from flows.plan import CityPlan
+from presight_core.failpoints import failpoint
 from presight_core.priors.documents import Generation, GenerationTile, TileEntry
 from stages.validation import validate_tile
+from storage.leases import Lease
 from storage.priors import PriorStore
+from storage.restoration import remember_build
 from storage.workspace import Workspace
 
 
@@ -36,9 +39,12 @@ class Built:
 
 
 def publish(
-    workspace: Workspace, plan: CityPlan, built: list[Built], failed: dict[str, tuple[Job, str]]
+    workspace: Workspace, plan: CityPlan, built: list[Built], failed: dict[str, tuple[Job, str]], lease: Lease
 ) -> dict[str, Any]:
-    """Publish what passes validation as one generation, and write every tile's end into the catalog."""
+    """Publish what passes validation as one generation, and write every tile's end into the catalog.
+
+    Raises LeaseLostError or ConflictError, with nothing published, if the run was taken for dead meanwhile.
+    """
     store, catalog = workspace.store(), workspace.catalog()
     old = store.generation(plan.city)
     accepted, errors = [], {tile_id: error for tile_id, (_, error) in failed.items()}
@@ -52,10 +58,19 @@ def publish(
     number = plan.generation
     if accepted:
         names = {drive.drive_id: drive.name for drive in plan.drives}
-        tiles = {tile.job.tile_id: tile.tile(names) for tile in accepted}
-        number = store.publish(plan.city, tiles, plan.generation, plan.tiling.to_json())
-    for tile in accepted:
-        catalog.finish_build(tile.job.build_id, "published", {**tile.metrics, "generation": number})
+        rows = {build.build_id: build for build in catalog.running(plan.city)}
+        now = catalog.now()
+        tiles = {
+            tile.job.tile_id: remember_build(tile.tile(names), rows.get(tile.job.build_id), now) for tile in accepted
+        }
+        failpoint("publish-before")
+        # In this order: whoever takes the lease after this line raises the fence before they do anything else.
+        catalog.leases.require(lease)
+        number = store.publish(plan.city, tiles, plan.generation, plan.tiling.to_json(), lease.token)
+        failpoint("publish-after")
+        for tile in accepted:
+            metrics = {**tile.metrics, "generation": number}
+            catalog.finish_build(tile.job.build_id, "published", metrics, finished_at=now)
     for job, error in failed.values():
         catalog.finish_build(job.build_id, "failed", {}, error)
     return {

@@ -10,7 +10,7 @@ from prefect.cache_policies import NO_CACHE
 
 from flows.jobs import Job
 from flows.launch import WorkerLostError, run_job
-from presight_core.errors import ConflictError
+from presight_core.errors import BuildError, ConflictError
 from presight_core.progress import Progress
 
 
@@ -57,6 +57,7 @@ def _work(command: str, job: Job) -> dict[str, Any]:
     catalog = job.opened_workspace.catalog()
 
     def report(progress: Progress) -> None:
-        catalog.progress(job.build_id, progress)
+        if not catalog.progress(job.build_id, progress):
+            raise BuildError(f"{command}: somebody ended build {job.build_id} in the catalog; its work is given up")
 
     return run_job(command, job, report)

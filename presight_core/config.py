@@ -80,7 +80,7 @@ class FieldSettings(Settings):
     hidden_width: Count = 64
     proposal_width: Count = 64  # hidden units of the proposal networks (paper: 64 everywhere)
     geometry_channels: Count = 15
-    video_embedding: Count = 12
+    video_embedding: Annotated[int, Field(ge=0)] = 12
     image_embedding: Annotated[int, Field(ge=0)] = 4
     density_bias: float = -4.0  # metres; the released code, whose poses are scaled by 0.05, needs none
 
@@ -107,6 +107,16 @@ class LossSettings(Settings):
     distortion: float = 0.002
 
 
+class GroundSettings(Settings):
+    """Where the road must be: as far below the cameras that passed as they are mounted above it. Not of the paper."""
+
+    weight: Annotated[float, Field(ge=0)] = 0.0  # of the loss; 0: nothing is known of the ground, as in the paper
+    camera_height_m: Metres = 1.53  # above the road; the mean of nuScenes' six cameras
+    tolerance_m: Metres = 0.1  # the road lies within this of where it must be
+    curb_m: Annotated[float, Field(ge=0)] = 0.2  # sidewalks may be this much higher
+    reach_m: Metres = 20.0  # only ground this near to a camera, on the map, is known
+
+
 class TrainingSettings(Settings):
     """How a tile's field is optimised."""
 
@@ -118,6 +128,7 @@ class TrainingSettings(Settings):
     decay: Share = 0.33
     weight_decay: float = 1e-5  # not on hash tables
     anneal: Share = 0.1  # share of the steps over which proposal weights sharpen
+    thin_weight: Annotated[float, Field(ge=1)] = 1.0  # how much likelier pixels of poles, signs and fences are drawn
     image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     keyframes_only: bool = False
     holdout_every: Annotated[int, Field(ge=0)] = 8  # every 8th frame of a camera is kept for evaluation; 0: none
@@ -125,6 +136,7 @@ class TrainingSettings(Settings):
     checkpoint_every: Count = 2000
     seed: int = 0
     loss: LossSettings = LossSettings()
+    ground: GroundSettings = GroundSettings()
 
 
 class ExtractionSettings(Settings):
@@ -168,6 +180,7 @@ class WorkspaceSettings(Settings):
     catalog: str | None = None  # SQLAlchemy URL
     store: str | None = None  # folder or object-store URL of the prior store
     caches: str | None = None  # folder for frames, features and training scratch
+    lease_s: Annotated[float, Field(ge=1)] = 60.0  # a build that is silent for so long is taken for dead
 
 
 SettingsType = TypeVar("SettingsType", bound=Settings)

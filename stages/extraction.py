@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from presight_core import classes
 from presight_core.cameras import pixel_centres
@@ -23,12 +22,10 @@ from presight_core.pixels import PixelSource, cell_of
 from presight_core.priors.schema import VoxelBatch
 from presight_core.progress import Progress, Report, silent
 from presight_core.tiles import Tiling
+from stages.camera_heights import CameraHeights
 from stages.observed_columns import ObservedColumns
 from stages.training import holdout_mask
 from stages.voxel_sums import CELLS, SUPERBLOCK, Samples, Superblock, VoxelSums
-
-HEIGHT_CELL_M = 2.0  # cameras this near count as one place, so that a parked vehicle does not outvote the road
-HEIGHT_CELLS = 4  # places averaged: about 8 m of road
 
 
 @dataclass(frozen=True)
@@ -114,28 +111,6 @@ def chosen_rows(job: TileExtraction) -> list[int]:
     rows = np.sort(by_time[place_in_drive % settings.extraction.frame_stride == 0])
     blocks = job.lattice.block_of(job.lattice.voxel_of(frames.positions[rows]))
     return rows[np.argsort(morton(blocks), kind="stable")].tolist()
-
-
-class CameraHeights:
-    """How high the cameras near a place were: what heights are relative to, so that hills do not matter.
-
-    Where roads cross on two levels, this is between them.
-    """
-
-    def __init__(self, positions_world: NDArray[np.float64]) -> None:
-        cells = np.floor(positions_world[:, :2] / HEIGHT_CELL_M).astype(np.int64)
-        _, inverse, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        sums = np.zeros((len(counts), 3))
-        np.add.at(sums, inverse.ravel(), positions_world)
-        places = sums / counts[:, None]
-        self._tree = KDTree(places[:, :2])
-        self._heights_m = places[:, 2]
-
-    def at(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Mean height (N,), metres, of the cameras nearest to points (N, 3), distances taken on the map."""
-        count = min(HEIGHT_CELLS, len(self._heights_m))
-        _, nearest = self._tree.query(points_world[:, :2], k=count)
-        return self._heights_m[nearest.reshape(len(points_world), count)].mean(-1)
 
 
 def _rays(job: TileExtraction, row: int, source: PixelSource, counts: Counter[str]) -> Rays:

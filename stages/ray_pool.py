@@ -12,6 +12,7 @@ from presight_core.drives import FrameTable
 from presight_core.errors import InputError
 from presight_core.pixels import FramePixels, PixelSource
 
+THIN = ("pole", "traffic light", "traffic sign", "fence")  # a few pixels wide: even draws hardly ever meet them
 DRAW_ROUNDS = 100  # of a batch each; images nine tenths of which are masked still fill a batch long before
 
 
@@ -99,16 +100,18 @@ def draw_static(
     groups: Sequence[NDArray[np.int64]],
     random: np.random.Generator,
     dynamic_classes: tuple[str, ...],
+    thin_weight: float = 1.0,
 ) -> PixelBatch:
-    """`count` random pixels that show nothing of the given classes.
+    """`count` random pixels that show nothing of the given classes; those of THIN classes `thin_weight` times likelier.
 
     Raises InputError if the images show hardly anything else.
     """
-    is_dynamic = classes.lookup(dynamic_classes)
+    share = np.where(classes.lookup(THIN), 1.0, 1 / thin_weight) * ~classes.lookup(dynamic_classes)
     batches, missing = [], count
     for _ in range(DRAW_ROUNDS):
-        batch = pool.draw(count + count // 4, groups, random)  # a quarter more: traffic rarely covers more than that
-        batch = batch.select(~is_dynamic[batch.labels])
+        # A quarter more than the weights ask for: traffic rarely covers more than that.
+        batch = pool.draw(int(count * thin_weight * 1.25), groups, random)
+        batch = batch.select(random.random(len(batch.rows)) < share[batch.labels])
         batches.append(batch.select(np.arange(len(batch.rows)) < missing))
         missing -= len(batches[-1].rows)
         if not missing:

@@ -2,7 +2,7 @@
 
 import hashlib
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import Recipe
 from presight_core.tiles import SubField
 from stages import versions
+from stages.ground import Ground, Stretches
 from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
 
 REPORT_SECONDS = 0.5
@@ -95,7 +96,7 @@ def _train(job: TileTraining, run: "Run", pools: "_Pools", log: "_Log") -> None:
     for step in range(run.step, settings.steps):
         pool, groups = pools.at(step)
         random = np.random.default_rng([settings.seed, step])
-        batch = draw_static(pool, settings.batch_rays, groups, random, dynamic)
+        batch = draw_static(pool, settings.batch_rays, groups, random, dynamic, settings.thin_weight)
         log.add(step, run.train(step, batch))
         if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
             log.flush(step)
@@ -133,6 +134,17 @@ def holdout_mask(frames: FrameTable, every: int) -> NDArray[np.bool_]:
 def video_numbers(frames: FrameTable) -> NDArray[np.int64]:
     """The number of each frame's video (drive) in the field's embedding."""
     return np.unique(frames.drive_id, return_inverse=True)[1].astype(np.int64)
+
+
+def image_numbers(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.int64]:
+    """The number of each trained frame in the field's embedding, -1 of the others.
+
+    Frames that are not trained on have none: their random rows would spoil the mean that evaluation uses.
+    """
+    numbers = np.full(len(frames), -1, np.int64)
+    rows = training_rows(frames, settings)
+    numbers[rows] = np.arange(len(rows))
+    return numbers
 
 
 def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -183,8 +195,8 @@ class Run:
         self.step, self.metrics = 0, {}
         self._job, self._settings = job, job.settings.training
         self._file = scratch / "training.safetensors"
-        self._videos = video_numbers(job.frames)
-        self.field = _new_field(job, int(self._videos.max()) + 1)
+        self._videos, self._images = video_numbers(job.frames), image_numbers(job.frames, self._settings)
+        self.field = _new_field(job, int(self._videos.max()) + 1, int(self._images.max()) + 1)
         self._names = {id(parameter): name for name, parameter in self.field.named_parameters()}
         is_table = {id(parameter): name.endswith("grid.table") for name, parameter in self.field.named_parameters()}
         tables = [parameter for parameter in self.field.parameters() if is_table[id(parameter)]]
@@ -193,6 +205,8 @@ class Run:
         # 1e-15 (Instant-NGP): a hash row's gradients are tiny and rare, the usual 1e-8 would swallow them.
         self._optimiser = torch.optim.AdamW(groups, weight_decay=self._settings.weight_decay, eps=1e-15, fused=True)
         self._generator = torch.Generator(job.device)
+        ground = self._settings.ground
+        self._ground = Ground(job.frames.positions, ground) if ground.weight else None
         self._resume()
 
     def train(self, step: int, batch: PixelBatch) -> dict[str, Tensor]:
@@ -203,7 +217,11 @@ class Run:
         self._generator.manual_seed(self._settings.seed << 32 | step)
         trains_proposals = schedule.trains_proposals(step, self._settings)
         sampling = Sampling(self._generator, schedule.anneal_exponent(step, self._settings), trains_proposals)
-        parts = self._losses(self.field(self._rays(batch), sampling), batch, trains_proposals)
+        stretches = self._ground.stretches(batch) if self._ground else None
+        rendering = self.field(self._rays(batch, stretches), sampling)
+        parts = self._losses(rendering, batch, trains_proposals)
+        if stretches:
+            parts["ground"] = self._settings.ground.weight * self._ground_loss(rendering, stretches)
         torch.stack(list(parts.values())).sum().backward()
         self._optimiser.step()
         self._optimiser.zero_grad()
@@ -237,8 +255,15 @@ class Run:
         for name, parameter in self.field.named_parameters():
             self._optimiser.state[parameter] = {quantity: values[name] for quantity, values in state.items()}
 
-    def _rays(self, batch: PixelBatch) -> Rays:
-        return self.field.rays(batch.origins_world, batch.directions_world, self._videos[batch.rows], batch.rows)
+    def _rays(self, batch: PixelBatch, stretches: Stretches | None) -> Rays:
+        videos, images = self._videos[batch.rows], self._images[batch.rows]
+        rays = self.field.rays(batch.origins_world, batch.directions_world, videos, images)
+        return replace(rays, ends_m=torch.from_numpy(stretches.end_m).to(self._job.device)) if stretches else rays
+
+    def _ground_loss(self, rendering: Rendering, stretches: Stretches) -> Tensor:
+        middles_m = (rendering.edges_m[:, 1:] + rendering.edges_m[:, :-1]) / 2
+        start_m = torch.from_numpy(stretches.start_m).to(self._job.device)
+        return losses.ground_loss(rendering.field.weights, middles_m, start_m)
 
     def _losses(self, rendering: Rendering, batch: PixelBatch, trains_proposals: bool) -> dict[str, Tensor]:
         """The five losses (paper, section 3.2), weighted."""
@@ -258,12 +283,11 @@ class Run:
         return parts
 
 
-def _new_field(job: TileTraining, video_count: int) -> TileField:
+def _new_field(job: TileTraining, video_count: int, image_count: int) -> TileField:
     """A field with random parameters that depend on the seed alone."""
     settings = job.settings
-    shape = FieldShape(
-        job.sub_fields, settings.field, settings.sampling, job.feature_channels, video_count, len(job.frames)
-    )
+    counts = (job.feature_channels, video_count, image_count)
+    shape = FieldShape(job.sub_fields, settings.field, settings.sampling, *counts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.training.seed)
         field = TileField(shape).to(job.device)

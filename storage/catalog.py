@@ -4,13 +4,14 @@ Safe for many threads and processes at once. Time comes from the catalog's own c
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
 from presight_core.errors import ConflictError, InputError, NotFoundError
 from storage.database import Database, Query, open_database
+from storage.leases import Clock, Lease, Leases, require_current, text_of
 from storage.migrations import HEAD
 
 if TYPE_CHECKING:  # these import numpy, which `presight status` has no time for
@@ -19,7 +20,6 @@ if TYPE_CHECKING:  # these import numpy, which `presight status` has no time for
     from presight_core.recipes import Recipe
     from presight_core.tiles import Tiling
 
-Clock = Callable[[], datetime]
 Ending = Literal["built", "published", "failed"]
 
 
@@ -42,6 +42,7 @@ class Build:
     started_at: str
     updated_at: str
     finished_at: str | None
+    lease_token: int | None = None  # of the lease that it runs under
 
 
 def utc_now() -> datetime:
@@ -55,6 +56,7 @@ class Catalog:
     def __init__(self, database: Database, clock: Clock = utc_now) -> None:
         self._database = database
         self._clock = clock
+        self.leases = Leases(database, clock)
 
     @staticmethod
     def open(url: str, clock: Clock = utc_now) -> "Catalog":
@@ -69,7 +71,11 @@ class Catalog:
             upgrade(database)
         return Catalog(database, clock)
 
-    def add_drive(self, drive: "Drive", rejects: "Sequence[Reject]" = ()) -> bool:
+    def now(self) -> str:
+        """The time by the catalog's clock, as it is recorded."""
+        return self._now()
+
+    def add_drive(self, drive: "Drive", rejects: "Sequence[Reject]" = (), added_at: str | None = None) -> bool:
         """Record a drive and what was refused of it; False if it is there already, then only its place is updated.
 
         A drive of the same scene, root and version with other content is replaced: it is removed from its city.
@@ -77,22 +83,23 @@ class Catalog:
         """
         if not drive.frame_count:
             raise InputError(f"{drive.name}: no good frame; correct what its rejects name and ingest it again")
+        now = added_at or self._now()
         with self._database.writing() as query:
             known = query("SELECT removed_at FROM drives WHERE drive_id = :drive_id", drive_id=drive.drive_id)
-            self._remove(query, "root = :root AND version = :version AND name = :name AND drive_id <> :drive_id", drive)
+            query(REMOVE_DRIVES + SAME_SCENE, **asdict(drive), now=now)
             if known:
                 query(REPLACE_DRIVE, **asdict(drive))
                 return known[0]["removed_at"] is not None
-            query(ADD_DRIVE, **asdict(drive), added_at=self._now())
+            query(ADD_DRIVE, **asdict(drive), added_at=now)
             _add_rejects(query, drive.drive_id, rejects)
             return True
 
-    def remove_drive(self, drive_id: str) -> None:
+    def remove_drive(self, drive_id: str, removed_at: str | None = None) -> None:
         """Take a drive out of its city; its record stays. Raises NotFoundError if there is none."""
         with self._database.writing() as query:
             if not query("SELECT 1 FROM drives WHERE drive_id = :drive_id", drive_id=drive_id):
                 raise NotFoundError(f"no drive {drive_id}; `presight status` lists what there is")
-            query(REMOVE_DRIVES + "drive_id = :drive_id", drive_id=drive_id, now=self._now())
+            query(REMOVE_DRIVES + "drive_id = :drive_id", drive_id=drive_id, now=removed_at or self._now())
 
     def drives(self, city: str | None = None) -> "list[Drive]":
         """The drives of a city, or of all, by capture time."""
@@ -126,7 +133,7 @@ class Catalog:
         with self._database.reading() as query:
             return [Reject(**row) for row in query(REJECTS_OF_CITY, city=city)]
 
-    def save_tiling(self, tiling: "Tiling", settings: Mapping[str, Any]) -> None:
+    def save_tiling(self, tiling: "Tiling", settings: Mapping[str, Any], created_at: str | None = None) -> None:
         """Record a tiling, or append its new tiles to the recorded one. The newest tiling is its city's.
 
         Raises ConflictError if a recorded tile would move or vanish.
@@ -142,7 +149,7 @@ class Catalog:
                     city=tiling.city,
                     tiling_id=tiling.tiling_id,
                     settings=json.dumps(settings, sort_keys=True),
-                    created_at=self._now(),
+                    created_at=created_at or self._now(),
                 )[0]["tiling_number"]
             _require_unmoved(tiling, tiles)
             for place, tile in enumerate(tiling.tiles[len(tiles) :], start=len(tiles)):
@@ -167,26 +174,46 @@ class Catalog:
             newest = query(NEWEST_TILING, city=city)
         return json.loads(newest[0]["settings"]) if newest else {}
 
-    def start_build(self, city: str, tile_id: str, recipe: "Recipe") -> int:
-        """Record the start of a build; its id."""
+    def tiling_created_at(self, city: str) -> str | None:
+        """When the city's tiling was first recorded."""
+        with self._database.reading() as query:
+            newest = query(NEWEST_TILING, city=city)
+        return newest[0]["created_at"] if newest else None
+
+    def start_build(self, city: str, tile_id: str, recipe: "Recipe", lease: Lease | None = None) -> int:
+        """Record the start of a build; its id. Raises LeaseLostError if the lease is no longer the city's."""
         values = {"city": city, "tile_id": tile_id, "recipe": json.dumps(recipe.to_json()), "digest": recipe.digest}
         with self._database.writing() as query:
-            return query(START_BUILD, **values, now=self._now())[0]["build_id"]
+            if lease:
+                require_current(query, lease)
+            token = lease.token if lease else None
+            return query(START_BUILD, **values, token=token, now=self._now())[0]["build_id"]
 
-    def progress(self, build_id: int, progress: "Progress") -> None:
-        """Record where a running build is; a build that has ended stays as it is."""
+    def progress(self, build_id: int, progress: "Progress") -> bool:
+        """Record where a running build is; False for a build that has ended, which stays as it is."""
         values = {"stage": progress.stage, "done": int(progress.done), "total": int(progress.total)}
+        values |= {"figures": json.dumps(progress.figures), "now": self._now()}
         with self._database.writing() as query:
-            query(PROGRESS, build_id=build_id, **values, figures=json.dumps(progress.figures), now=self._now())
+            return bool(query(PROGRESS, build_id=build_id, **values))
 
     def finish_build(
-        self, build_id: int, state: Ending, metrics: Mapping[str, Any] | None = None, error: str = ""
+        self,
+        build_id: int,
+        state: Ending,
+        metrics: Mapping[str, Any] | None = None,
+        error: str = "",
+        finished_at: str | None = None,
     ) -> None:
-        """Record a build's end. `metrics` None leaves those recorded before. Raises NotFoundError for no such build."""
+        """Record a build's end, now or at a time told. `metrics` None leaves those recorded before.
+
+        Raises NotFoundError for no such build, ConflictError for one that failed already: its run was taken for dead.
+        """
         encoded = None if metrics is None else json.dumps(dict(metrics))
         with self._database.writing() as query:
             values = {"build_id": build_id, "state": state, "metrics": encoded, "error": error}
-            if not query(FINISH_BUILD, **values, now=self._now()):
+            if not query(FINISH_BUILD, **values, now=finished_at or self._now()):
+                if query("SELECT 1 FROM builds WHERE build_id = :build_id", build_id=build_id):
+                    raise ConflictError(f"build {build_id} was ended before, as failed; run `presight build` again")
                 raise NotFoundError(f"no build {build_id}; start it with start_build")
 
     def builds(self, city: str, state: str | None = None) -> list[Build]:
@@ -195,11 +222,27 @@ class Catalog:
             rows = query(LATEST_BUILDS, city=city, state=state)
         return [_build(row) for row in rows]
 
-    def _remove(self, query: Query, which: str, drive: "Drive") -> None:
-        query(REMOVE_DRIVES + which, **asdict(drive), now=self._now())
+    def restore_build(self, build: Build) -> None:
+        """Record a build that ended long ago, under a number of its own."""
+        values = {
+            **vars(build),
+            **{name: json.dumps(getattr(build, name)) for name in ("recipe", "figures", "metrics")},
+        }
+        with self._database.writing() as query:
+            query(RESTORE_BUILD, **{name: value for name, value in values.items() if name != "build_id"})
+
+    def running(self, city: str) -> list[Build]:
+        """Builds of a city that are not ended."""
+        with self._database.reading() as query:
+            return [_build(row) for row in query(RUNNING, city=city)]
+
+    def orphans(self, city: str | None = None) -> list[Build]:
+        """Running builds, of a city or of all, whose lease is over: nobody works on them, and nobody ever will."""
+        with self._database.reading() as query:
+            return [_build(row) for row in query(ORPHANS, city=city)]
 
     def _now(self) -> str:
-        return self._clock().astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+        return text_of(self._clock())
 
 
 def _add_rejects(query: Query, drive_id: str, rejects: "Sequence[Reject]") -> None:
@@ -229,6 +272,7 @@ REMOVE_DRIVES = "UPDATE drives SET removed_at = :now WHERE removed_at IS NULL AN
 ADD_REJECT = """
     INSERT INTO rejects (drive_id, code, file, detail, cure, drive)
     VALUES (:drive_id, :code, :file, :detail, :cure, :drive)"""
+SAME_SCENE = "root = :root AND version = :version AND name = :name AND drive_id <> :drive_id"
 REJECTS_OF_DRIVE = "SELECT code, file, detail FROM rejects WHERE drive_id = :drive_id"
 REJECTS_OF_CITY = """
     SELECT code, file, detail, cure, drive FROM rejects WHERE drive_id IN
@@ -243,16 +287,29 @@ ADD_TILE = """
     INSERT INTO tiles (tiling_number, place, tile_id, x_m, y_m) VALUES (:number, :place, :tile_id, :x_m, :y_m)"""
 START_BUILD = """
     INSERT INTO builds (city, tile_id, recipe, recipe_digest, state, stage, done, total, figures, metrics, error,
-                        started_at, updated_at)
-    VALUES (:city, :tile_id, :recipe, :digest, 'running', '', 0, 0, '{}', '{}', '', :now, :now) RETURNING build_id"""
+                        started_at, updated_at, lease_token)
+    VALUES (:city, :tile_id, :recipe, :digest, 'running', '', 0, 0, '{}', '{}', '', :now, :now, :token)
+    RETURNING build_id"""
+RESTORE_BUILD = """
+    INSERT INTO builds (city, tile_id, recipe, recipe_digest, state, stage, done, total, figures, metrics, error,
+                        started_at, updated_at, finished_at, lease_token)
+    VALUES (:city, :tile_id, :recipe, :recipe_digest, :state, :stage, :done, :total, :figures, :metrics, :error,
+            :started_at, :updated_at, :finished_at, :lease_token)"""
 PROGRESS = """
     UPDATE builds SET stage = :stage, done = :done, total = :total, figures = :figures, updated_at = :now
-    WHERE build_id = :build_id AND state = 'running'"""
+    WHERE build_id = :build_id AND state = 'running' RETURNING build_id"""
 FINISH_BUILD = """
     UPDATE builds SET state = :state, metrics = COALESCE(:metrics, metrics), error = :error, updated_at = :now,
                       finished_at = :now
-    WHERE build_id = :build_id RETURNING build_id"""
+    WHERE build_id = :build_id AND state <> 'failed' RETURNING build_id"""
 LATEST_BUILDS = """
     SELECT * FROM builds WHERE build_id IN
     (SELECT MAX(build_id) FROM builds WHERE city = :city AND state = COALESCE(:state, state) GROUP BY tile_id)
     ORDER BY tile_id"""
+RUNNING = "SELECT * FROM builds WHERE state = 'running' AND city = :city ORDER BY build_id"
+ORPHANS = """
+    SELECT builds.* FROM builds LEFT JOIN leases ON leases.city = builds.city
+    WHERE builds.state = 'running' AND builds.city = COALESCE(:city, builds.city)
+    AND (leases.token IS NULL OR builds.lease_token IS NULL OR builds.lease_token <> leases.token
+         OR leases.ended_at IS NOT NULL)
+    ORDER BY builds.build_id"""

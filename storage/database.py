@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from presight_core.errors import ConflictError, MissingDependencyError, StoreError
+from presight_core.failpoints import failpoint
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection, Engine
@@ -104,7 +105,9 @@ class SqliteDatabase:
         with _sqlite_errors(self.file), _connected(self.file) as connection:
             connection.execute(begin)
             yield _SqliteQuery(connection)
+            failpoint("catalog-before-commit")
             connection.execute("COMMIT")  # an exception closes the connection instead: SQLite rolls back
+        failpoint("catalog-after-commit")
 
 
 @contextmanager
@@ -172,6 +175,8 @@ class SqlalchemyDatabase:
             if lock:
                 take_write_lock(connection)
             yield _SqlalchemyQuery(connection)
+            failpoint("catalog-before-commit")
+        failpoint("catalog-after-commit")
 
     @contextmanager
     def _connected(self) -> "Iterator[Connection]":

@@ -17,6 +17,7 @@ from pyarrow import parquet
 
 from presight_core.drives import Drive, FrameTable, Reject
 from presight_core.errors import NotFoundError, StoreError
+from presight_core.failpoints import failpoint
 from storage.folders import force_to_disk
 
 FORMAT = 1  # of the columns and metadata below
@@ -31,17 +32,45 @@ class DriveIndex:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def add(self, drive: Drive, frames: FrameTable, rejects: Sequence[Reject] = ()) -> None:
-        """Write a drive's file, unless the same is there already. Raises StoreError if the disk refuses."""
+    def add(self, drive: Drive, frames: FrameTable, rejects: Sequence[Reject] = (), added_at: str = "") -> str:
+        """Write a drive's file, unless the same is there already; when it was first added.
+
+        A drive that was marked as removed is so no more. Raises StoreError if the disk refuses.
+        """
+        self._removed(drive.drive_id).unlink(missing_ok=True)
+        added_at = self.added_at(drive.drive_id) or added_at
         if self._has_same(drive, rejects):
-            return
-        description = {"format": FORMAT, "drive": asdict(drive), "rejects": [asdict(reject) for reject in rejects]}
+            return added_at
+        description = {
+            "format": FORMAT,
+            "drive": asdict(drive),
+            "rejects": [asdict(reject) for reject in rejects],
+            "added_at": added_at,
+        }
         table = _to_arrow(frames).replace_schema_metadata({METADATA_KEY: json.dumps(description).encode()})
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             _write_whole(table, self._file(drive.drive_id))
         except OSError as error:
             raise StoreError(f"{self.folder}: drive {drive.name} not written: {error}; free the disk") from error
+        return added_at
+
+    def added_at(self, drive_id: str) -> str:
+        """When a drive was first added, UTC in ISO 8601; empty if nobody wrote it down, or there is no such drive."""
+        try:
+            return self._description(drive_id).get("added_at", "")
+        except (NotFoundError, StoreError):
+            return ""
+
+    def mark_removed(self, drive_id: str, removed_at: str) -> None:
+        """Write down that a drive was taken out of its city: it must not come back with the catalog."""
+        self._existing(drive_id)
+        self._removed(drive_id).write_text(removed_at, encoding="utf-8")
+
+    def removed_at(self, drive_id: str) -> str | None:
+        """When a drive was taken out of its city, if it was."""
+        file = self._removed(drive_id)
+        return file.read_text(encoding="utf-8") if file.is_file() else None
 
     def frames(self, drive_id: str) -> FrameTable:
         """The frames of a drive, ordered by camera and time. Raises NotFoundError, or StoreError if damaged."""
@@ -82,6 +111,9 @@ class DriveIndex:
         if description["format"] != FORMAT:
             raise StoreError(f"{file}: format {description['format']}, not {FORMAT}; ingest the drive again")
         return description
+
+    def _removed(self, drive_id: str) -> Path:
+        return self._file(drive_id).with_suffix(".removed")
 
     def _existing(self, drive_id: str) -> Path:
         file = self._file(drive_id)
@@ -134,8 +166,10 @@ def _write_whole(table: pa.Table, file: Path) -> None:
             parquet.write_table(table, target, compression="zstd")
             target.flush()
             os.fsync(target.fileno())
+        failpoint("drive-before-rename")
         part.replace(file)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
     force_to_disk(file.parent)
+    failpoint("drive-after-rename")

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
+from presight_core.failpoints import failpoint
+
 
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
@@ -20,7 +22,9 @@ def whole_folder(final: Path) -> Iterator[Path]:
     try:
         yield temporary
         _force_tree_to_disk(temporary)
+        failpoint("folder-before-rename")
         _rename(temporary, final)
+        failpoint("folder-after-rename")
         force_to_disk(final.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -2,6 +2,9 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from operator import attrgetter
 from pathlib import Path
 
 import obstore
@@ -9,6 +12,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, ObjectStore
 
 from presight_core.errors import StoreError
+from presight_core.failpoints import failpoint
 from presight_core.priors.location import local_folder
 
 
@@ -25,10 +29,12 @@ def open_store(location: str | Path) -> ObjectStore:
 def put_once(store: ObjectStore, path: str, content: bytes) -> bool:
     """Create an object, or leave the one that is there: False. At most one of many writers sees True."""
     with storing(path):
+        failpoint("store-before-put")
         try:
             obstore.put(store, path, content, mode="create")
         except AlreadyExistsError:
             return False
+        failpoint("store-after-put")
         return True
 
 
@@ -42,17 +48,38 @@ def exists(store: ObjectStore, path: str) -> bool:
         return True
 
 
+def remove(store: ObjectStore, paths: list[str]) -> None:
+    """Delete objects."""
+    with storing(paths[0] if paths else ""):
+        obstore.delete(store, paths)
+
+
 def remove_all(store: ObjectStore, folder: str) -> None:
     """Delete every object under a folder."""
+    remove(store, [entry.path for entry in objects(store, folder)])
+
+
+@dataclass(frozen=True)
+class StoredObject:
+    """One object of the store."""
+
+    path: str
+    size: int  # bytes
+    modified: datetime
+
+
+def objects(store: ObjectStore, folder: str) -> list[StoredObject]:
+    """Every object under a folder, by path."""
     with storing(folder):
-        for objects in obstore.list(store, folder):
-            obstore.delete(store, [entry["path"] for entry in objects])
+        found = [entry for entries in obstore.list(store, folder) for entry in entries]
+    return sorted(
+        (StoredObject(entry["path"], entry["size"], entry["last_modified"]) for entry in found), key=attrgetter("path")
+    )
 
 
 def size_bytes(store: ObjectStore, folder: str) -> int:
     """Bytes of all objects under a folder."""
-    with storing(folder):
-        return sum(entry["size"] for objects in obstore.list(store, folder) for entry in objects)
+    return sum(entry.size for entry in objects(store, folder))
 
 
 @contextmanager

@@ -1,8 +1,8 @@
 """The prior store: cities, immutable builds of tiles, and the generations that publish them."""
 
-import json
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +11,23 @@ from obstore.store import ObjectStore
 from presight_core.errors import ConflictError, InputError, NotFoundError, StoreError
 from presight_core.grid import Lattice
 from presight_core.priors.documents import (
+    VERSION,
     CityDocument,
     Generation,
     GenerationTile,
     TileEntry,
     checked_name,
     city_path,
+    decode,
     encode,
     generation_path,
+    tag_path,
 )
 from presight_core.priors.location import ReadLocation
-from presight_core.priors.reader import PriorReader, generation_numbers, read_city, read_generation
-from presight_core.priors.schema import VoxelBatch
+from presight_core.priors.reader import PriorReader, generation_numbers, read_city, read_generation, read_tag
+from presight_core.priors.schema import FEATURE_STEP, VoxelBatch
 from presight_core.priors.summary import TileSummary
-from storage.location import exists, open_store, put_once, size_bytes
+from storage.location import exists, open_store, put_once, remove, size_bytes
 from storage.tile_groups import TileName, write_group
 
 MOST_ATTEMPTS = 100  # each lost race means that somebody else published; so many in one call is a fault
@@ -43,9 +46,14 @@ class PriorStore:
         """The store in a folder (made if absent) or at a URL. Raises StoreError if it cannot be had."""
         return PriorStore(location, open_store(location), ReadLocation(location))
 
-    def create_city(self, city: str, lattice: Lattice, space_id: str, channel_count: int) -> CityDocument:
-        """The city's fixed facts, stored now or before. Raises ConflictError if they were stored differently."""
-        wanted = CityDocument(city, lattice, space_id, channel_count)
+    def create_city(
+        self, city: str, lattice: Lattice, space_id: str, channel_count: int, feature_step: int = FEATURE_STEP
+    ) -> CityDocument:
+        """The city's fixed facts, stored now or before. Raises ConflictError if they were stored differently.
+
+        feature_step: 1, 3 or 5; features are kept in steps of that many 255ths.
+        """
+        wanted = CityDocument(city, lattice, space_id, channel_count, feature_step)
         if not put_once(self._objects, city_path(city), encode(wanted.to_json())):
             present = self.city(city)
             if present != wanted:
@@ -76,29 +84,65 @@ class PriorStore:
         tiles: Mapping[str, GenerationTile],
         parent: int | None,
         tiling: Mapping[str, Any] | None = None,
+        fence: int | None = None,
     ) -> int:
         """Publish builds as one new generation; its number.
 
         `parent` is the generation that the builds were planned on (None: the city had none), and the new
         one keeps its other tiles. If others published meanwhile, their tiles are kept too. `tiling`
         (`Tiling.to_json`) is needed for the first generation; tiles that a new tiling has not, or has
-        elsewhere, are no longer shown.
+        elsewhere, are no longer shown. `fence` is the fencing number of the publisher's lease, if it has one.
 
-        Raises ConflictError if somebody else published one of the same tiles or another tiling meanwhile,
+        Raises ConflictError if somebody else published one of the same tiles or another tiling meanwhile, or
+        was given a greater fencing number,
         StoreError if a build is not whole, NotFoundError if `parent` is not there.
         """
         facts = self.city(city)
         self._check_builds(facts, tiles)
         for _ in range(MOST_ATTEMPTS):
             head = self.generation(city)
+            _check_fence(city, head, fence)
             self._check_meanwhile(city, tiles, parent, head, tiling)
-            generation = _next(facts, head, tiles, tiling)
-            content = encode(generation.to_json())
-            path = generation_path(city, generation.number)
-            # A put whose answer was lost may have landed: then what is there is our own document.
-            if put_once(self._objects, path, content) or self._source.read(path) == content:
+            generation = replace(
+                _next(facts, head, tiles, tiling),
+                parent_sha256=self._sha256(head),
+                fence=max(fence or 0, head.fence if head else 0),
+            )
+            if self._commit(generation):
                 return generation.number
         raise ConflictError(f"{city}: {MOST_ATTEMPTS} other generations came first; run it again")
+
+    def raise_fence(self, city: str, fence: int) -> None:
+        """Shut out every publisher with a smaller fencing number, also one that is about to put its generation.
+
+        That takes a generation of its own, equal to the one before: it has the number that theirs would have
+        had. A city that the store does not know has no such publisher. Raises ConflictError for a greater fence.
+        """
+        if not exists(self._objects, city_path(city)):
+            return
+        facts = self.city(city)
+        for _ in range(MOST_ATTEMPTS):
+            head = self.generation(city)
+            _check_fence(city, head, fence)
+            if head and head.fence == fence:
+                return
+            empty = {"tiling_id": "none", "city": city, "tiles": []}  # nothing is published yet
+            following = _next(facts, head, {}, head.tiling if head else empty)
+            if self._commit(replace(following, parent_sha256=self._sha256(head), fence=fence)):
+                return
+        raise ConflictError(f"{city}: {MOST_ATTEMPTS} other generations came first; run it again")
+
+    def fence(self, city: str) -> int:
+        """The greatest fencing number that published in the city; 0 if none did."""
+        head = self.generation(city)
+        return head.fence if head else 0
+
+    def _commit(self, generation: Generation) -> bool:
+        """Put the generation if its number is free; False if somebody else has it."""
+        content = encode(generation.to_json())
+        path = generation_path(generation.city, generation.number)
+        # A put whose answer was lost may have landed: then what is there is our own document.
+        return put_once(self._objects, path, content) or self._source.read(path) == content
 
     def generation(self, city: str, number: int | None = None) -> Generation | None:
         """A generation; for None the newest, or None if nothing is published. Raises NotFoundError for others."""
@@ -110,12 +154,51 @@ class PriorStore:
         """Numbers of the published generations, ascending."""
         return generation_numbers(self._source, city)
 
+    def tag(self, city: str, tag: str, number: int | None = None) -> int:
+        """Name a generation, the newest if not given, for good: readers may ask for it, and nothing of it is deleted.
+
+        Its number. Raises ConflictError if the tag stands for another one, NotFoundError without such a generation.
+        """
+        generation = read_generation(self._source, city, number)
+        self.save_document(city, "tags", tag, {"generation": generation.number})
+        return generation.number
+
+    def tags(self, city: str) -> dict[str, int]:
+        """The generation of every tag."""
+        names = [name.removesuffix(".json") for name in self._source.names(f"{checked_name(city)}/tags")]
+        return {name: read_tag(self._source, city, name) for name in names}
+
+    def remove_tag(self, city: str, tag: str) -> None:
+        """Take a tag away; the generation stays, until it is old. Raises NotFoundError if there is no such tag."""
+        read_tag(self._source, city, tag)
+        remove(self._objects, [tag_path(city, tag)])
+
+    def rollback(self, city: str, number: int) -> int:
+        """Publish a new generation that shows exactly what an earlier one did; its number.
+
+        Raises ConflictError if somebody published meanwhile, NotFoundError without such a generation,
+        StoreError if a build of it is gone.
+        """
+        old, head = read_generation(self._source, city, number), read_generation(self._source, city, None)
+        new = replace(
+            old,
+            number=head.number + 1,
+            parent=head.number,
+            parent_sha256=self._sha256(head),
+            restores=number,
+            fence=head.fence,
+        )
+        self._check_builds(self.city(city), old.tiles)
+        if not self._commit(new):
+            raise ConflictError(f"{city}: generation {new.number} came first; look at it, then run it again")
+        return new.number
+
     def summary(self, city: str, tile: GenerationTile) -> TileSummary:
         """The extent of a written build, published or not."""
         facts = self.city(city)
         tiles = {"tile": tile}
         table = PriorReader(self.location, facts, Generation(0, None, city, facts.space_id, {}, tiles)).tile("tile")
-        return TileSummary(tile.entry.voxel_count, table.block_index, table.all_rows("observed"))
+        return TileSummary(tile.entry.voxel_count, table.block_index, table.observed)
 
     def size_bytes(self, city: str) -> int:
         """Bytes of everything the store keeps of a city: all builds and generations."""
@@ -126,9 +209,14 @@ class PriorStore:
 
         Saving the same again does nothing. Raises ConflictError if the name stands for something else.
         """
-        path, content = _document_path(city, kind, name), encode(value)
+        path, content = _document_path(city, kind, name), encode({**value, "format_version": VERSION})
         if not put_once(self._objects, path, content) and self._source.read(path) != content:
             raise ConflictError(f"{self.location}/{path} is there with other content; use another name")
+
+    def documents(self, city: str, kind: str) -> list[str]:
+        """Names of the documents of a kind that `save_document` kept, sorted."""
+        names = self._source.names(f"{checked_name(city)}/{checked_name(kind)}")
+        return [name.removesuffix(".json") for name in names if name.endswith(".json")]
 
     def document(self, city: str, kind: str, name: str) -> dict[str, Any]:
         """A document that `save_document` kept. Raises NotFoundError if it is not there."""
@@ -136,10 +224,14 @@ class PriorStore:
         content = self._source.read(path)
         if content is None:
             raise NotFoundError(f"{self.location} has no {path}; save it first")
-        try:
-            return json.loads(content)
-        except ValueError as error:
-            raise StoreError(f"{self.location}/{path}: {error}; restore it from a copy of the store") from error
+        return decode(content, f"{self.location}/{path}", _without_version)
+
+    def _sha256(self, generation: Generation | None) -> str | None:
+        """The digest of a generation's file, which the next one carries."""
+        if generation is None:
+            return None
+        content = self._source.read(generation_path(generation.city, generation.number))
+        return hashlib.sha256(content or b"").hexdigest()
 
     def _check_builds(self, facts: CityDocument, tiles: Mapping[str, GenerationTile]) -> None:
         for tile_id, tile in tiles.items():
@@ -176,6 +268,14 @@ class PriorStore:
             raise ConflictError(f"{city}: generation {head.number} brought another tiling; plan and build again")
 
 
+def _check_fence(city: str, head: Generation | None, fence: int | None) -> None:
+    if head and fence is not None and head.fence > fence:
+        raise ConflictError(
+            f"{city}: generation {head.number} has fencing number {head.fence}, this run {fence}: it was taken for "
+            "dead and may no longer publish; run `presight build` again"
+        )
+
+
 def _next(
     facts: CityDocument,
     head: Generation | None,
@@ -200,6 +300,10 @@ def _next(
 
 def _places(tiling: Mapping[str, Any]) -> dict[str, Any]:
     return {tile["tile_id"]: tile["centroid_m"] for tile in tiling["tiles"]}
+
+
+def _without_version(value: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: item for name, item in value.items() if name != "format_version"}
 
 
 def _document_path(city: str, kind: str, name: str) -> str:

@@ -1,6 +1,7 @@
 """Sorting points by the sub-field they belong to, and putting results back in order."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -9,12 +10,21 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Assignment:
-    """A stable sort of points by sub-field. `order` is None where there is one sub-field only."""
+    """A stable sort of points by sub-field. `order` is None where there is one sub-field only.
+
+    Its tensors' shapes depend on the number of points alone, and nothing is read back from the device unless
+    `bounds` are asked for.
+    """
 
     segments: Tensor  # (sub-fields + 1,) int64: rows segments[s]..segments[s + 1] of the sorted points
-    bounds: list[int]  # the same, for Python
-    order: Tensor | None  # (N,) original row of each sorted row
-    places: Tensor | None  # (N,) sorted row of each original row
+    order: Tensor | None = None  # (N,) original row of each sorted row
+    places: Tensor | None = None  # (N,) sorted row of each original row
+    owner: Tensor | None = None  # (N,) sub-field of each sorted row
+
+    @cached_property
+    def bounds(self) -> list[int]:
+        """The segments, for Python."""
+        return self.segments.tolist()
 
     def sort(self, values: Tensor) -> Tensor:
         """Rows (N, ...) of the original order, sorted by sub-field."""
@@ -26,23 +36,22 @@ class Assignment:
 
     def spread(self, values: Tensor) -> Tensor:
         """A row for each sorted point, of one row (sub-fields, ...) for each sub-field."""
-        return values if self.order is None else values.repeat_interleave(self.segments.diff(), 0)
+        return values if self.owner is None else values.index_select(0, self.owner)
 
 
 def assign(points: Tensor, centroids: Tensor) -> Assignment:
     """Points (N, 3) to the nearest of the centroids (sub-fields, 3) (paper, section 3.2)."""
     count = len(centroids)
     if count == 1:
-        bounds = [0, len(points)]
-        return Assignment(torch.tensor(bounds, device=points.device), bounds, None, None)
+        return Assignment(torch.arange(2, device=points.device) * len(points))
     # |p - c|^2 less what all centroids share, halved.
     distances = (centroids.square().sum(-1) / 2) - points.detach() @ centroids.T
-    sub_field = distances.argmin(-1)
-    order = torch.argsort(sub_field, stable=True)
+    small = torch.uint8 if count < 256 else torch.int32  # the sort moves these, digit by digit
+    owner, order = torch.sort(distances.argmin(-1).to(small), stable=True)
     places = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
-    segments = torch.zeros(count + 1, dtype=torch.int64, device=points.device)
-    segments[1:] = torch.bincount(sub_field, minlength=count).cumsum(0)
-    return Assignment(segments, segments.tolist(), order, places)
+    owner = owner.int()
+    segments = torch.searchsorted(owner, torch.arange(count + 1, dtype=torch.int32, device=points.device))
+    return Assignment(segments, order, places, owner)
 
 
 class _Permutation(torch.autograd.Function):

@@ -21,6 +21,15 @@ def sky_loss(accumulation: Float[Tensor, " rays"], is_sky: Bool[Tensor, " rays"]
     return -torch.where(is_sky, 1 - bounded, bounded).log().mean()
 
 
+def ground_loss(
+    weights: Weights, middles_m: Float[Tensor, "rays bins"], start_m: Float[Tensor, " rays"]
+) -> Float[Tensor, ""]:
+    """Negative logarithm of the weight beyond `start_m`, mean over rays; rays that start at 0 cost nothing."""
+    beyond = (weights * (middles_m > start_m[:, None])).sum(-1)
+    # Below a thousandth the slope would be steeper than is good for a step.
+    return torch.where(start_m > 0, -beyond.clamp(1e-3, 1).log(), 0).mean()
+
+
 def distortion_loss(edges: Edges, weights: Weights) -> Tensor:
     """Mean over rays of `distortion`."""
     return distortion(edges, weights).mean()

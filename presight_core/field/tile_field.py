@@ -64,6 +64,7 @@ class Rays:
     directions: Float[Tensor, "rays 3"]  # unit length
     videos: Int[Tensor, " rays"] | None = None
     images: Int[Tensor, " rays"] | None = None
+    ends_m: Float[Tensor, " rays"] | None = None  # nothing lies beyond; None or inf: the far plane
 
     def points(self, edges_m: Float[Tensor, "rays edges"]) -> Float[Tensor, "rays samples 3"]:
         """The middle of each stretch between two edges."""
@@ -123,7 +124,7 @@ class DensityNetwork(nn.Module):
 
     def forward(self, positions: Tensor, assignment: Assignment) -> Tensor:
         """Outputs (N, outputs) at positions (N, 3) of the grids, sorted by sub-field."""
-        return self.network(self.grid(positions, assignment.segments), assignment.bounds)
+        return self.network(self.grid(positions, assignment.segments), assignment)
 
 
 class TileField(nn.Module):
@@ -216,6 +217,8 @@ class TileField(nn.Module):
         far_m = settings.far_m
         if settings.floor_m is not None:
             far_m = samplers.far_above_floor(rays.directions, far_m, settings.floor_m, settings.floor_slope)
+        if rays.ends_m is not None:
+            far_m = torch.minimum(rays.ends_m[:, None], torch.as_tensor(far_m, device=rays.ends_m.device))
         return samplers.Spacing(settings.near_m, far_m, settings.linear_m)
 
     def place_samples(
@@ -246,8 +249,8 @@ class TileField(nn.Module):
         )
         of_rays = conditions.to(density.dtype).repeat_interleave(sample_count, 0)
         seen = torch.cat([geometry_values, assignment.sort(of_rays)], -1)
-        rgb = torch.sigmoid(self.colour(seen, assignment.bounds).float())
-        features = self.semantics(torch.relu(hidden), assignment.bounds)
+        rgb = torch.sigmoid(self.colour(seen, assignment).float())
+        features = self.semantics(torch.relu(hidden), assignment)
         shape = ray_count, sample_count
         return PointValues(
             assignment.restore(self._activate(density[:, 0], inside)).view(shape),
@@ -293,8 +296,8 @@ class TileField(nn.Module):
         """Colour (R, 3) and features (R, C) of the sky; the features ignore the video."""
         assignment = assign(rays.origins, self.centroids)
         seen = assignment.sort(conditions[:, : HARMONICS + self.shape.settings.video_embedding])
-        rgb = torch.sigmoid(self.sky_colour(seen, assignment.bounds).float())
-        features = self.sky_features(seen[:, :HARMONICS], assignment.bounds).float()
+        rgb = torch.sigmoid(self.sky_colour(seen, assignment).float())
+        features = self.sky_features(seen[:, :HARMONICS], assignment).float()
         return assignment.restore(rgb), assignment.restore(features)
 
     def _jitter(self, rays: Rays, sampling: Sampling) -> Tensor | None:

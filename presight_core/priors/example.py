@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from presight_core.grid import Lattice, morton
-from presight_core.priors.schema import VoxelBatch, pack_columns, pack_voxels, word_count
+from presight_core.priors.schema import FEATURE_STEP, VoxelBatch, pack_columns, pack_voxels, word_count
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,8 @@ class ExampleTile:
         size, total = self.lattice.block_columns, len(voxel)
         # Places share most of their look, so that compression is neither helped nor hindered much.
         look = random.integers(0, 256, (16, self.channel_count))[random.integers(0, 16, total)]
-        features = np.clip(look + random.normal(0, 10, look.shape), 0, 255).astype(np.uint8)
+        noisy = np.clip(look + random.normal(0, 10, look.shape), 0, 255)
+        features = (noisy // FEATURE_STEP * FEATURE_STEP).astype(np.uint8)  # so that storing them changes nothing
         return VoxelBatch(
             block_index=blocks,
             block_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),

@@ -4,6 +4,8 @@ Folders are read without obstore. Its threads do not survive a fork, and data lo
 """
 
 import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -11,11 +13,10 @@ import obstore
 from obstore.exceptions import BaseError
 from obstore.store import ObjectStore as RemoteStore
 from obstore.store import from_url
-from zarr.abc.store import ByteRequest, Store
-from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import LocalStore, ObjectStore, WrapperStore
 
 from presight_core.errors import StoreError
+
+MOST_REQUESTS = 32  # at once: hides the latency of an object store, and stays below its limits for one client
 
 _remote_pid: list[int] = []  # the process that first reached an object store; a fork of it cannot
 
@@ -49,6 +50,11 @@ class ReadLocation:
         except (OSError, BaseError) as error:
             raise StoreError(f"{self._name}/{path}: {error}; check the location and your access to it") from error
 
+    @property
+    def is_remote(self) -> bool:
+        """Whether every read costs a request."""
+        return not isinstance(self._place, Path)
+
     def names(self, folder: str) -> list[str]:
         """Names of the objects directly in a folder; empty if there is none."""
         try:
@@ -61,21 +67,12 @@ class ReadLocation:
         except (OSError, BaseError) as error:
             raise StoreError(f"{self._name}/{folder}: {error}; check the location and your access to it") from error
 
-    def zarr_store(self) -> Store:
-        """A read-only Zarr store of the location, in which a lost chunk is an error."""
-        if isinstance(self._place, Path):
-            return _NoChunkMayBeAbsent(LocalStore(self._place, read_only=True))
-        return _NoChunkMayBeAbsent(ObjectStore(self._place, read_only=True))
-
-
-class _NoChunkMayBeAbsent(WrapperStore[Store]):
-    """Zarr reads an absent chunk as its fill value, which would be an empty road. Every chunk is written, so raise."""
-
-    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        content = await super().get(key, prototype, byte_range)
-        if content is None and not key.endswith("zarr.json"):
-            raise StoreError(f"chunk {key} is missing")
-        return content
+    def read_all(self, paths: Sequence[str]) -> list[bytes | None]:
+        """The contents of many objects; those at a URL are fetched side by side."""
+        if isinstance(self._place, Path) or len(paths) < 2:
+            return [self.read(path) for path in paths]
+        with ThreadPoolExecutor(min(len(paths), MOST_REQUESTS)) as pool:
+            return list(pool.map(self.read, paths))
 
 
 def _remote_store(url: str) -> RemoteStore:

@@ -1,19 +1,16 @@
-"""Reads the prior around a vehicle from a store: only the blocks it needs, only numpy, zarr and obstore."""
+"""Reads the prior around a vehicle from a store: only the chunks it needs, and no Zarr library."""
 
 import os
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import ArrayLike, NDArray
-from zarr.abc.store import Store
 
 from presight_core.errors import NotFoundError, StoreError
 from presight_core.grid import Lattice
+from presight_core.priors.chunks import ChunkCache
 from presight_core.priors.documents import (
     GENERATION_FILE,
     CityDocument,
@@ -23,41 +20,44 @@ from presight_core.priors.documents import (
     decode,
     generation_path,
     generations_path,
+    tag_path,
 )
 from presight_core.priors.location import ReadLocation
-from presight_core.priors.schema import (
-    CENTROID_STEPS,
-    array_specs,
-    drive_bits,
-    unpack_columns,
-    unpack_voxels,
-    word_count,
-)
+from presight_core.priors.schema import array_specs
+from presight_core.priors.tile_table import LOOK_ARRAYS, TilePart, TileTable
 from presight_core.priors.window import Range, Window, WindowBox
 
-VOXEL_ARRAYS = ("voxel", "centroid", "features", "hits", "density", "rgb")
-CURE = "restore the store from a copy, or rebuild the tile and publish again"
+CACHE_BYTES = 128 << 20  # of decoded chunks in each reader, so in each worker of a data loader: 1.5 million voxels
 
 
 class PriorReader:
     """A city's priors at one generation, pinned. Can be pickled, and used after a fork of the process."""
 
-    def __init__(self, location: str | Path, city: CityDocument, generation: Generation) -> None:
+    def __init__(
+        self, location: str | Path, city: CityDocument, generation: Generation, cache_bytes: int = CACHE_BYTES
+    ) -> None:
         self._location = location
         self._city = city
+        self._cache_bytes = cache_bytes
+        self._unbuilt = _unbuilt_tiles(generation)
         self.generation = generation
-        self._tables: dict[str, TileTable] = {}
-        self._pid = os.getpid()
+        self._forget()
 
     @staticmethod
-    def open(location: str | Path, city: str, generation: int | None = None) -> "PriorReader":
-        """The reader of a city in the store at `location` (folder or URL); the newest generation unless given.
+    def open(
+        location: str | Path, city: str, generation: int | str | None = None, cache_bytes: int = CACHE_BYTES
+    ) -> "PriorReader":
+        """The reader of a city in the store at `location` (folder or URL).
+
+        generation: a number or a tag; the newest if not given.
+        cache_bytes: decoded chunks that the reader may keep, so that windows nearby are read once. Beside them
+        it holds about 150 bytes of tables for every block of 32 x 32 columns in the tiles it has met.
 
         Raises NotFoundError if the city or generation is not there, StoreError if it is damaged or newer
         than this program, or if its tiles are in different feature spaces.
         """
         source = ReadLocation(location)
-        return PriorReader(location, read_city(source, city), read_generation(source, city, generation))
+        return PriorReader(location, read_city(source, city), read_generation(source, city, generation), cache_bytes)
 
     @property
     def tiles(self) -> tuple[str, ...]:
@@ -101,105 +101,74 @@ class PriorReader:
         without_drives: voxels that no other drive saw are left out; the others keep what all drives made of them.
         Raises InputError for a pose that is not rigid, StoreError if stored data is lost or damaged.
         """
-        box = WindowBox.at(world_from_ego, x_m, y_m, z_m)
-        tiles = [tile_id for tile_id in self.tiles if _may_meet(box, self.generation.tiles[tile_id], self.lattice)]
-        parts = {
-            tile_id: part for tile_id in tiles if (part := self.tile(tile_id).read(box, without_drives)) is not None
-        }
-        return _window(box, self.lattice, self.channel_count, parts)
+        return self._window(WindowBox.at(world_from_ego, x_m, y_m, z_m), without_drives)
 
-    def tile(self, tile_id: str) -> "TileTable":
+    def windows(
+        self,
+        world_from_ego: Sequence[ArrayLike],
+        x_m: Range = (-50.0, 50.0),
+        y_m: Range = (-25.0, 25.0),
+        z_m: Range = (-3.0, 5.0),
+        without_drives: Collection[str] = (),
+    ) -> list[Window]:
+        """The same as `window`, at several poses. From an object store, all that they need is fetched side by side.
+
+        That takes a `cache_bytes` that holds the chunks of the batch.
+        """
+        boxes = [WindowBox.at(pose, x_m, y_m, z_m) for pose in world_from_ego]
+        if boxes and ReadLocation(self._location).is_remote:
+            blocks = np.unique(np.concatenate([box.blocks(self.lattice) for box in boxes]), axis=0)
+            for tile_id in self._tiles_with(blocks):
+                self.tile(tile_id).warm(blocks)
+        return [self._window(box, without_drives) for box in boxes]
+
+    def tile(self, tile_id: str) -> TileTable:
         """One tile's table, opened when first asked for. Raises NotFoundError for a tile not in the generation."""
-        if self._pid != os.getpid():  # a fork: open anew, and share no file or connection with the parent
-            self._tables, self._pid = {}, os.getpid()
+        if self._pid != os.getpid():  # a fork: share no connection and no lock with the parent
+            self._forget()
         if tile_id not in self.generation.tiles:
             raise NotFoundError(f"{self._city.city} generation {self.generation.number} has no tile {tile_id}")
         if tile_id not in self._tables:
-            store = ReadLocation(self._location).zarr_store()
-            self._tables[tile_id] = TileTable.open(store, self._city, self.generation.tiles[tile_id])
+            tile = self.generation.tiles[tile_id]
+            self._tables[tile_id] = TileTable.open(ReadLocation(self._location), self._city, tile, self._cache)
         return self._tables[tile_id]
 
+    def _window(self, box: WindowBox, without_drives: Collection[str]) -> Window:
+        blocks = box.blocks(self.lattice)
+        parts = {
+            tile_id: part
+            for tile_id in self._tiles_with(blocks)
+            if (part := self.tile(tile_id).read(box, blocks, without_drives)) is not None
+        }
+        missing = self._missing_tiles(box) if self._unbuilt else ()
+        return _window(box, self.lattice, self.channel_count, parts, missing)
+
+    def _tiles_with(self, blocks: NDArray[np.int32]) -> list[str]:
+        """Tiles whose bounds meet those of the blocks (N, 2)."""
+        if not len(blocks):
+            return []
+        least, greatest = blocks.min(0).tolist(), blocks.max(0).tolist()
+        return [tile_id for tile_id in self.tiles if _may_meet(self.generation.tiles[tile_id], least, greatest)]
+
+    def _missing_tiles(self, box: WindowBox) -> tuple[str, ...]:
+        """Tiles without a build whose centroid is the nearest one to the box's middle or to one of its corners."""
+        names = [tile["tile_id"] for tile in self.generation.tiling["tiles"]]
+        centroids = np.array([tile["centroid_m"] for tile in self.generation.tiling["tiles"]])
+        places = np.vstack([box.corners_world[:, :2], box.corners_world[:, :2].mean(0)])
+        nearest = np.linalg.norm(places[:, None] - centroids, axis=-1).argmin(1)
+        return tuple(sorted({names[place] for place in nearest} & self._unbuilt))
+
+    def _forget(self) -> None:
+        self._tables: dict[str, TileTable] = {}
+        self._cache = ChunkCache(self._cache_bytes)
+        self._pid = os.getpid()
+
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_tables": {}}
+        return {name: value for name, value in self.__dict__.items() if name not in {"_tables", "_cache", "_pid"}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _pid=os.getpid())
-
-
-@dataclass(frozen=True)
-class TilePart:
-    """The part of one tile that lies in a box."""
-
-    columns: dict[str, NDArray]  # the voxel arrays, by name, and points_world, points_ego
-    blocks: NDArray[np.int32]  # (B, 2)
-    observed: NDArray[np.bool_]  # (B, columns, columns)
-
-
-@dataclass(frozen=True)
-class TileTable:
-    """One opened build of a tile: its block tables in memory, its voxels in the store."""
-
-    name: str
-    lattice: Lattice
-    arrays: dict[str, zarr.Array]
-    block_index: NDArray[np.int32]  # (B, 2)
-    block_start: NDArray[np.int64]  # (B + 1,)
-    drives: tuple[str, ...]  # in bit order
-
-    @staticmethod
-    def open(store: Store, city: CityDocument, tile: GenerationTile) -> "TileTable":
-        """The table of a tile. Raises StoreError if an array is missing or does not fit the generation's entry."""
-        entry, name = tile.entry, f"{city.city}/{tile.entry.path}"
-        specs = array_specs(city.channel_count, len(entry.drives), city.lattice.block_columns)
-        with _naming(name):
-            arrays = {key: zarr.open_array(store, path=f"{name}/{key}", mode="r", zarr_format=3) for key in specs}
-            block_index = np.asarray(arrays["block_index"][:])
-            block_start = np.asarray(arrays["block_start"][:])
-        rows = {"block": entry.block_count, "block edge": entry.block_count + 1, "voxel": entry.voxel_count}
-        for key, spec in specs.items():
-            expected = (rows[spec.rows], *spec.row_shape)
-            if arrays[key].shape != expected or arrays[key].dtype != spec.dtype:
-                raise StoreError(
-                    f"{name}/{key}: {arrays[key].dtype}{arrays[key].shape}, expected {spec.dtype}{expected}"
-                )
-        return TileTable(name, city.lattice, arrays, block_index, block_start, entry.drives)
-
-    def read(self, box: WindowBox, without_drives: Collection[str] = ()) -> TilePart | None:
-        """The voxels, of those that other drives saw, and observed columns in the box; None if no block meets it."""
-        blocks = np.flatnonzero(box.meets(self.block_index, self.lattice))
-        if not len(blocks):
-            return None
-        counts = np.diff(self.block_start)[blocks]
-        rows = _ranges(self.block_start[blocks], counts)
-        columns = {name: self.rows(name, rows) for name in VOXEL_ARRAYS}
-        block_of_row = np.repeat(self.block_index[blocks], counts, axis=0)
-        points_world = _points(columns["voxel"], columns["centroid"], block_of_row, self.lattice)
-        points_ego, inside = box.inside(points_world)
-        if not set(self.drives).isdisjoint(without_drives):
-            inside &= self._seen_by_others(rows, without_drives)
-        columns |= {"points_world": points_world, "points_ego": points_ego.astype(np.float32)}
-        observed = unpack_columns(self.rows("observed", blocks))
-        return TilePart({name: column[inside] for name, column in columns.items()}, self.block_index[blocks], observed)
-
-    def rows(self, name: str, rows: NDArray[np.int64]) -> NDArray:
-        """The given ascending rows of an array; every chunk that holds one is read once."""
-        array = self.arrays[name]
-        result = np.empty((len(rows), *array.shape[1:]), array.dtype)
-        for first, last in _chunk_runs(rows, array.chunks[0]):
-            low, high = np.searchsorted(rows, [first, last])
-            with _naming(f"{self.name}/{name}"):
-                result[low:high] = np.asarray(array[first : min(last, array.shape[0])])[rows[low:high] - first]
-        return result
-
-    def _seen_by_others(self, rows: NDArray[np.int64], without_drives: Collection[str]) -> NDArray[np.bool_]:
-        count = len(self.drives)
-        others = [drive_bits(bit, count) for bit, drive in enumerate(self.drives) if drive not in without_drives]
-        kept = np.bitwise_or.reduce([np.zeros(word_count(count), np.uint32), *others])
-        return (self.rows("drives", rows) & kept).any(-1)
-
-    def all_rows(self, name: str) -> NDArray:
-        """A whole array."""
-        return self.rows(name, np.arange(self.arrays[name].shape[0]))
+        self.__dict__.update(state)
+        self._forget()
 
 
 def read_city(source: ReadLocation, city: str) -> CityDocument:
@@ -217,8 +186,13 @@ def generation_numbers(source: ReadLocation, city: str) -> list[int]:
     return sorted(int(match[1]) for match in matches if match)
 
 
-def read_generation(source: ReadLocation, city: str, number: int | None) -> Generation:
-    """A generation of a city, the newest for None. Raises NotFoundError if there is none, StoreError if unreadable."""
+def read_generation(source: ReadLocation, city: str, number: int | str | None) -> Generation:
+    """A generation of a city, by number or tag, the newest for None.
+
+    Raises NotFoundError if there is none, StoreError if it is unreadable.
+    """
+    if isinstance(number, str):
+        number = read_tag(source, city, number)
     if number is None:
         numbers = generation_numbers(source, city)
         if not numbers:
@@ -229,75 +203,63 @@ def read_generation(source: ReadLocation, city: str, number: int | None) -> Gene
     if content is None:
         raise NotFoundError(f"{source} has no generation {number} of {city}; ask for one that was published")
     generation = decode(content, f"{source}/{path}", Generation.from_json)
+    if (generation.number, generation.city) != (number, city):
+        raise StoreError(
+            f"{source}/{path} holds generation {generation.number} of {generation.city}; restore it from a copy"
+        )
     spaces = {generation.space_id} | {tile.entry.space_id for tile in generation.tiles.values()}
     if len(spaces) > 1:
         raise StoreError(f"{source}/{path}: tiles of different feature spaces {sorted(spaces)}; rebuild the older ones")
     return generation
 
 
-def _may_meet(box: WindowBox, tile: GenerationTile, lattice: Lattice) -> bool:
-    (left, bottom), (right, top) = box.block_range(lattice)
-    least_x, least_y, greatest_x, greatest_y = tile.entry.block_bounds
-    apart = left > greatest_x or bottom > greatest_y or right < least_x or top < least_y
-    return tile.entry.block_count > 0 and not bool(apart)
+def read_tag(source: ReadLocation, city: str, tag: str) -> int:
+    """The generation that a tag names. Raises NotFoundError if there is no such tag."""
+    path = tag_path(city, tag)
+    content = source.read(path)
+    if content is None:
+        raise NotFoundError(f"{source} has no tag {tag} of {city}; set it with `presight tag`")
+    return decode(content, f"{source}/{path}", lambda value: int(value["generation"]))
 
 
-def _points(
-    packed: NDArray[np.uint32], centroid: NDArray[np.uint8], blocks: NDArray[np.int32], lattice: Lattice
-) -> NDArray[np.float64]:
-    """World points (N, 3): the middle of the centroid's quantisation step."""
-    corner = lattice.voxel_min(unpack_voxels(packed, blocks, lattice))
-    return corner + (centroid + 0.5) * (lattice.voxel_m / CENTROID_STEPS)
+def _may_meet(tile: GenerationTile, least: list[int], greatest: list[int]) -> bool:
+    left, bottom, right, top = tile.entry.block_bounds
+    apart = least[0] > right or least[1] > top or greatest[0] < left or greatest[1] < bottom
+    return tile.entry.block_count > 0 and not apart
 
 
-def _window(box: WindowBox, lattice: Lattice, channel_count: int, parts: dict[str, TilePart]) -> Window:
+def _unbuilt_tiles(generation: Generation) -> frozenset[str]:
+    return frozenset(tile["tile_id"] for tile in generation.tiling.get("tiles", ())) - generation.tiles.keys()
+
+
+def _window(
+    box: WindowBox, lattice: Lattice, channel_count: int, parts: dict[str, TilePart], missing: tuple[str, ...]
+) -> Window:
     least, greatest = box.block_range(lattice)
     size = lattice.block_columns
-    observed = np.zeros((greatest - least + 1) * size, np.bool_)
+    width, height = ((greatest - least + 1) * size).tolist()
+    observed = np.zeros((width, height), np.bool_)
     for part in parts.values():
-        for (x, y), flags in zip((part.blocks - least) * size, part.observed, strict=True):
+        for (x, y), flags in zip(((part.blocks - least) * size).tolist(), part.observed, strict=True):
             observed[x : x + size, y : y + size] |= flags
     origin = least * size
-    columns = np.stack(np.meshgrid(*(np.arange(n) for n in observed.shape), indexing="ij"), -1).reshape(-1, 2) + origin
-    ground = box.ground(columns, lattice).reshape(observed.shape)
+    ground = box.ground(origin, (width, height), lattice)
     observed &= ground
     return Window(
-        **_joined(channel_count, parts),
+        **_joined(channel_count, list(parts.values())),
         observed=observed,
         observed_origin=(int(origin[0]), int(origin[1])),
         coverage=float(observed.sum() / max(1, ground.sum())),
         tiles=tuple(parts),
+        missing_tiles=missing,
     )
 
 
-def _joined(channel_count: int, parts: dict[str, TilePart]) -> dict[str, NDArray]:
+def _joined(channel_count: int, parts: list[TilePart]) -> dict[str, NDArray]:
     """The voxel columns of all parts, one after the other; typed also when there are none."""
+    if len(parts) == 1:
+        return parts[0].columns
     specs = array_specs(channel_count, 0, 8)
-    empty = {name: np.zeros((0, *specs[name].row_shape), specs[name].dtype) for name in VOXEL_ARRAYS[2:]}
+    empty = {name: np.zeros((0, *specs[name].row_shape), specs[name].dtype) for name in LOOK_ARRAYS}
     empty |= {"points_ego": np.zeros((0, 3), np.float32), "points_world": np.zeros((0, 3))}
-    found = parts.values()
-    return {name: np.concatenate([none, *(part.columns[name] for part in found)]) for name, none in empty.items()}
-
-
-def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """start, start + 1, ..., start + count - 1 of every range, one after the other."""
-    offsets = np.cumsum(counts) - counts
-    return np.arange(counts.sum()) + np.repeat(starts - offsets, counts)
-
-
-def _chunk_runs(rows: NDArray[np.int64], chunk: int) -> Iterator[tuple[int, int]]:
-    """First row and end row of each run of neighbouring chunks that hold any of the ascending rows."""
-    chunks = rows // chunk
-    chunks = chunks[np.flatnonzero(np.diff(chunks, prepend=-1))]
-    for run in np.split(chunks, np.flatnonzero(np.diff(chunks) > 1) + 1):
-        if len(run):
-            yield int(run[0]) * chunk, (int(run[-1]) + 1) * chunk
-
-
-@contextmanager
-def _naming(name: str) -> Iterator[None]:
-    """Turns whatever a damaged array raises into a StoreError that names it."""
-    try:
-        yield
-    except Exception as error:
-        raise StoreError(f"{name} is damaged or cannot be read: {error}; {CURE}") from error
+    return {name: np.concatenate([none, *(part.columns[name] for part in parts)]) for name, none in empty.items()}

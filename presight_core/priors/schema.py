@@ -4,7 +4,7 @@ A tile is a table of voxels sorted by block (Morton order) and then by packed vo
 blocks beside it. `docs/prior-format.md` describes the same for readers in other languages.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -18,8 +18,9 @@ FORMAT_MINOR = 0  # additions that older readers of the same version may ignore
 CENTROID_STEPS = 256  # a centroid is stored in this many steps along each edge of its voxel
 HEIGHT_OFFSET = 1 << 15  # shifts signed voxel heights into 16 bits: +-13 km at 0.4 m
 WORD_BITS = 32  # drives per word of the drive bit set
-FEATURE_CHUNK_ROWS = 1 << 14  # voxels a chunk: 1 MB of features at 64 channels; about ten blocks of a street
-CHUNK_ROWS = 1 << 16  # of the narrow columns, where the cost is in the number of chunks more than in their size
+FEATURE_STEP = 3  # features are kept in steps of 3/255: docs/benchmarks/store.md weighs size against error
+FEATURE_CHUNK_ROWS = 1 << 11  # voxels a chunk, two blocks of a street: a window decodes little that it does not need
+CHUNK_ROWS = 1 << 13  # of the narrow columns, where the cost is in the number of chunks more than in their size
 NARROW_BYTES = 16  # a row
 BLOCK_CHUNK_ROWS = 1 << 10  # blocks a chunk: 128 kB of observed columns
 
@@ -31,6 +32,11 @@ class ArraySpec:
     dtype: str
     row_shape: tuple[int, ...]
     rows: Literal["block", "block edge", "voxel"]
+    chunk_rows: int = 0  # rows of a chunk, the other axes are never cut; 0 becomes this program's choice
+
+    def __post_init__(self) -> None:
+        if not self.chunk_rows:
+            object.__setattr__(self, "chunk_rows", self._chosen_chunk_rows)
 
     @property
     def row_bytes(self) -> int:
@@ -38,11 +44,18 @@ class ArraySpec:
         return int(np.prod(self.row_shape, dtype=np.int64)) * np.dtype(self.dtype).itemsize
 
     @property
-    def chunk_rows(self) -> int:
-        """Rows of a chunk; the other axes are never cut."""
+    def _chosen_chunk_rows(self) -> int:
         if self.rows != "voxel":
             return BLOCK_CHUNK_ROWS
         return CHUNK_ROWS if self.row_bytes <= NARROW_BYTES else FEATURE_CHUNK_ROWS
+
+    def with_chunk_rows(self, chunk_rows: int) -> "ArraySpec":
+        """The same array in other chunks: readers take their size from the store."""
+        return replace(self, chunk_rows=chunk_rows)
+
+    def chunk_count(self, row_count: int) -> int:
+        """Chunks that hold so many rows."""
+        return -(-row_count // self.chunk_rows)
 
 
 def array_specs(channel_count: int, drive_count: int, block_columns: int) -> dict[str, ArraySpec]:
@@ -78,7 +91,7 @@ class VoxelBatch:
     observed: NDArray[np.uint8]  # (B, columns, columns / 8) see `pack_columns`
     voxel: NDArray[np.uint32]  # (N,) see `pack_voxels`
     centroid: NDArray[np.uint8]  # (N, 3) in 1/256 of the voxel
-    features: NDArray[np.uint8]  # (N, C) 255 = 1.0
+    features: NDArray[np.uint8]  # (N, C) 255 = 1.0; stored coarser, see `pack_features`
     hits: NDArray[np.uint32]  # (N,) surface points averaged
     density: NDArray[np.float16]  # (N,) per metre
     rgb: NDArray[np.uint8]  # (N, 3)
@@ -117,6 +130,16 @@ def unpack_voxels(packed: NDArray[np.uint32], blocks: NDArray[np.int32], lattice
     corner = blocks.astype(np.int64) * lattice.block_columns
     x, y, z = words >> 24, words >> 16 & 0xFF, (words & 0xFFFF) - HEIGHT_OFFSET
     return np.stack([corner[:, 0] + x, corner[:, 1] + y, z], -1)
+
+
+def pack_features(features: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
+    """Codes of features (N, C): the nearest multiple of `step`, a divisor of 255, counted in steps."""
+    return ((features.astype(np.uint16) + step // 2) // step).astype(np.uint8)
+
+
+def unpack_features(codes: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
+    """Features (N, C), 255 = 1.0, of their codes; wrong by at most `step` // 2."""
+    return codes * np.uint8(step)
 
 
 def pack_columns(observed: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -28,6 +28,7 @@ class Window:
     observed_origin: tuple[int, int]  # lattice column of observed[0, 0]
     coverage: float  # share of the box's ground that is observed, 0..1
     tiles: tuple[str, ...]  # that hold blocks in the box
+    missing_tiles: tuple[str, ...] = ()  # of the tiling, near the box, that the generation has no build of
 
     def __len__(self) -> int:
         return len(self.hits)
@@ -66,6 +67,13 @@ class WindowBox:
         corners = self.corners_world
         return lattice.block_of(lattice.voxel_of(np.stack([corners.min(0), corners.max(0)]))).astype(np.int64)
 
+    def blocks(self, lattice: Lattice) -> NDArray[np.int32]:
+        """The blocks (N, 2) that may hold voxels of the box."""
+        least, greatest = self.block_range(lattice)
+        axes = [np.arange(low, high + 1) for low, high in zip(least, greatest, strict=True)]
+        blocks = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2).astype(np.int32)
+        return blocks[self.meets(blocks, lattice)]
+
     def meets(self, blocks: NDArray[np.int32], lattice: Lattice) -> NDArray[np.bool_]:
         """Which blocks (N, 2) may hold voxels of the box; exact for a level vehicle.
 
@@ -82,14 +90,26 @@ class WindowBox:
 
     def inside(self, points_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """World points (N, 3) in the ego frame, and which of them lie in the box."""
-        points_ego = frames.apply(frames.invert(self.world_from_ego), points_world)
-        low, high = np.transpose([self.x_m, self.y_m, self.z_m])
-        return points_ego, np.all((points_ego >= low) & (points_ego < high), -1)
+        rotation, position = self.world_from_ego[:3, :3], self.world_from_ego[:3, 3]
+        points_ego = rotation.T @ (points_world.T - position[:, None])  # axes apart, which is how tiles give them
+        inside = np.ones(len(points_world), np.bool_)
+        for values, (low, high) in zip(points_ego, (self.x_m, self.y_m, self.z_m), strict=True):
+            inside &= (values >= low) & (values < high)
+        return points_ego.T, inside
 
-    def ground(self, columns: NDArray[np.int64], lattice: Lattice) -> NDArray[np.bool_]:
-        """Which columns (N, 2) of the lattice meet the ego ground plane (z = 0), at their centres, in x_m and y_m."""
-        offsets = (columns + 0.5) * lattice.voxel_m + lattice.origin_m[:2] - self.world_from_ego[:2, 3]
+    def ground(self, origin: NDArray[np.int64], shape: tuple[int, int], lattice: Lattice) -> NDArray[np.bool_]:
+        """Which columns, `shape` of them from column `origin`, meet the ground in x_m and y_m, at their centres.
+
+        The ground is the ego plane z = 0. On it, the ego coordinates are linear in the column's x and y.
+        """
         up = self.world_from_ego[:3, 2]
-        offsets = np.column_stack([offsets, -(offsets @ up[:2]) / up[2]])
-        x, y = (offsets @ self.world_from_ego[:3, :2]).T
-        return (x >= self.x_m[0]) & (x < self.x_m[1]) & (y >= self.y_m[0]) & (y < self.y_m[1])
+        inside = np.ones(shape, np.bool_)
+        for axis, (low, high) in zip(self.world_from_ego[:3, :2].T, (self.x_m, self.y_m), strict=True):
+            slope = axis[:2] - axis[2] * up[:2] / up[2]
+            parts = []
+            for side in range(2):
+                centres = (origin[side] + np.arange(shape[side]) + 0.5) * lattice.voxel_m + lattice.origin_m[side]
+                parts.append((centres - self.world_from_ego[side, 3]) * slope[side])
+            values = parts[0][:, None] + parts[1]
+            inside &= (values >= low) & (values < high)
+        return inside

@@ -40,6 +40,7 @@ from presight_core.synthetic.shooting import Shooting
 from presight_core.synthetic.surface_points import Bounds, exposed, sample_surface, write_surface_points
 
 FORMAT = 2  # raise it when the same preset and seed would give other files
+STAMP = "synth_gt/synth.json"  # what the folder is for
 SURFACE_SPACING_M = 0.25  # finer than the voxels of a prior, 0.4 m
 SHADOW_MARGIN_M = 130.0  # past the ends of a drive
 
@@ -73,10 +74,21 @@ def write_dataset(
     draw_contact_sheet(root, preset)
 
 
+def city_of(root: Path, location: Location) -> City:
+    """A city of the data set in a folder, built again from what the folder says of itself."""
+    stamp = json.loads((root / STAMP).read_text(encoding="utf-8"))
+    return _build_city(SynthPreset(**stamp["preset"]), stamp["seed"], location)
+
+
+def _build_city(preset: SynthPreset, seed: int, location: Location) -> City:
+    locations = get_args(Location)
+    return City(seed * len(locations) + locations.index(location), preset.towns[location].style)
+
+
 def _claim(root: Path, preset: SynthPreset, seed: int) -> None:
     """Note what the folder is for, or refuse it if it is for something else."""
     wanted = {"format": FORMAT, "seed": seed, "preset": preset.model_dump(mode="json")}
-    stamp = root / "synth_gt" / "synth.json"
+    stamp = root / STAMP
     if not stamp.exists():
         write_json(stamp, wanted)
         return
@@ -110,8 +122,7 @@ class _TownWork:
 
     @cached_property
     def city(self) -> City:
-        locations = get_args(Location)
-        return City(self.seed * len(locations) + locations.index(self.location), self.preset.towns[self.location].style)
+        return _build_city(self.preset, self.seed, self.location)
 
     @cached_property
     def streets(self) -> tuple[Stretch, ...]:

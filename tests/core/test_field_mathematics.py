@@ -1,9 +1,11 @@
+import math
+
 import pytest
 import torch
 
 from presight_core.config import TrainingSettings
 from presight_core.field import losses, rendering, samplers, schedule
-from presight_core.field.assignment import assign
+from presight_core.field.assignment import Assignment, assign
 from presight_core.field.contraction import contract, grid_position
 from presight_core.field.mlp import SubFieldMlp
 from presight_core.field.spherical_harmonics import spherical_harmonics
@@ -114,6 +116,13 @@ def random_histogram(bins: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return edges, weights / weights.sum(-1, keepdim=True)
 
 
+def test_the_ground_loss_is_the_missing_weight_beyond_the_start_of_the_ground():
+    weights = torch.tensor([[0.25, 0.5, 0.0], [0.0, 0.0, 0.0]])
+    middles_m = torch.tensor([[1.0, 2.0, 3.0]]).expand(2, 3)
+    loss = losses.ground_loss(weights, middles_m, torch.tensor([1.5, 0.0]))
+    assert loss.item() == pytest.approx(-math.log(0.5) / 2)  # the second ray knows of no ground
+
+
 def test_distortion_equals_the_sum_over_all_pairs():
     edges, weights = random_histogram(9, 0)
     middles = (edges[:, 1:] + edges[:, :-1]) / 2
@@ -180,10 +189,89 @@ def test_restoring_passes_gradients_to_the_right_rows():
     assert values.grad.tolist() == [7, 5]
 
 
+def random_network(widths: tuple[int, ...], seed: int = 0) -> SubFieldMlp:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = SubFieldMlp(2, widths).double()
+    network.dtype = torch.float64
+    return network
+
+
+def test_gradients_of_networks_agree_with_finite_differences(monkeypatch):
+    monkeypatch.setattr("presight_core.field.mlp.BLOCK_ROWS", 2)  # blocks of one and of two rows
+    network = random_network((3, 4, 4, 2))
+    inputs = torch.randn(5, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64, requires_grad=True)
+    assignment = Assignment(torch.tensor([0, 2, 5]))
+
+    def outputs(inputs: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        return network(inputs, assignment)
+
+    assert torch.autograd.gradcheck(outputs, (inputs, *network.parameters()))
+
+
+def test_networks_equal_plain_layers_whatever_the_block(monkeypatch):
+    network = random_network((3, 8, 2))
+    inputs = torch.randn(50, 3, dtype=torch.float64)
+    whole = network(inputs, Assignment(torch.tensor([0, 20, 50])))
+    monkeypatch.setattr("presight_core.field.mlp.BLOCK_ROWS", 7)
+    torch.testing.assert_close(network(inputs, Assignment(torch.tensor([0, 20, 50]))), whole)
+    weights, biases = [weight[1] for weight in network.weights], [bias[1] for bias in network.biases]
+    plain = torch.relu(inputs[20:] @ weights[0].T + biases[0]) @ weights[1].T + biases[1]
+    torch.testing.assert_close(whole[20:], plain)
+
+
+def test_half_precision_networks_add_gradients_up_in_single_precision():
+    network = SubFieldMlp(1, (4, 4, 1))
+    network.dtype = torch.bfloat16
+    inputs = torch.ones(10_000, 4)
+    network(inputs, Assignment(torch.tensor([0, 10_000]))).float().sum().backward()
+    assert network.biases[1].grad.item() == 10_000  # bfloat16 stops counting at 256
+
+
+@pytest.mark.parametrize("exponent", [-3.0, 0.5, 4.0])
+def test_truncated_exponential_agrees_with_finite_differences_within_its_bounds(exponent):
+    x = torch.tensor([exponent], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(rendering.truncated_exponential, (x,))
+
+
+def test_gradients_of_restoring_agree_with_finite_differences():
+    points = torch.tensor([[9.0, 1, 0], [1, 0, 0], [0, 8, 1], [11, 0, 0]])
+    assignment = assign(points, torch.tensor([[0.0, 0, 0], [10, 0, 0], [0, 10, 0]]))
+    values = torch.randn(4, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(assignment.restore, (values,))
+
+
+def test_gradients_of_rendering_agree_with_finite_differences():
+    generator = torch.Generator().manual_seed(0)
+    density = torch.rand(3, 6, generator=generator, dtype=torch.float64, requires_grad=True)
+    lengths = torch.rand(3, 6, generator=generator, dtype=torch.float64)
+    values = torch.rand(3, 6, 2, generator=generator, dtype=torch.float64, requires_grad=True)
+
+    def seen(density: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        return rendering.blend(rendering.ray_weights(density, lengths), values)
+
+    assert torch.autograd.gradcheck(seen, (density, values))
+
+
+def test_gradients_of_losses_agree_with_finite_differences():
+    (edges, weights), (proposal_edges, proposal) = random_histogram(9, 2), random_histogram(7, 3)
+    weights.requires_grad_()
+    proposal.requires_grad_()
+    accumulation = torch.tensor([0.2, 0.7], dtype=torch.float64, requires_grad=True)
+    checks = [
+        (lambda value: losses.distortion_loss(edges, value), weights),
+        (lambda value: losses.interlevel_loss(edges, weights, proposal_edges, value), proposal),
+        (lambda value: losses.blurred_interlevel_loss(edges, weights, proposal_edges, value, 0.03), proposal),
+        (lambda value: losses.sky_loss(value, torch.tensor([True, False])), accumulation),
+    ]
+    for loss, value in checks:
+        assert torch.autograd.gradcheck(loss, (value,))
+
+
 def test_each_sub_field_has_its_own_network():
     network = SubFieldMlp(2, (3, 4, 2))
     inputs = torch.ones(5, 3)
-    outputs = network(inputs, [0, 2, 5])
+    outputs = network(inputs, Assignment(torch.tensor([0, 2, 5])))
     assert torch.equal(outputs[0], outputs[1])
     assert torch.equal(outputs[2], outputs[4])
     assert not torch.equal(outputs[0], outputs[2])

@@ -161,3 +161,16 @@ def test_frames_keep_the_pose_of_their_own_timestamp(workspace):
     frames = opened.drives().frames(opened.catalog().drives("toytown")[0].drive_id)
     front = frames.select(frames.camera == "CAM_FRONT")
     np.testing.assert_allclose(np.diff(front.positions[:, 0]), [0.83, 4.17, 0.83], atol=1e-9)
+
+
+def test_an_error_of_the_disk_is_one_line_and_status_4(monkeypatch, capsys):
+    from flows import cli
+
+    def full() -> None:
+        raise OSError(28, "No space left on device", "/somewhere")
+
+    monkeypatch.setattr(cli, "app", full)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 4
+    assert capsys.readouterr().err.startswith("error: [Errno 28] No space left on device: '/somewhere'; check the disk")

@@ -14,7 +14,7 @@ from presight_core.tiles import SubField
 from stages import training
 from stages.evaluation import evaluate_tile
 from stages.ray_pool import RayPool, draw_static
-from stages.training import TileTraining, holdout_mask, train_tile, training_rows
+from stages.training import TileTraining, holdout_mask, image_numbers, train_tile, training_rows
 
 EGO_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
 SIZE = (24, 16)
@@ -154,6 +154,14 @@ def test_held_out_frames_lie_between_trained_ones():
 def test_keyframes_only_leaves_sweeps_out():
     settings = tiny_settings("training.keyframes_only=true", "training.holdout_every=0").training
     assert training_rows(street(8), settings).tolist() == [0, 2, 4, 6]
+
+
+def test_only_trained_images_have_an_embedding(tmp_path):
+    job = tiny_job("training.steps=1")
+    numbers = image_numbers(job.frames, job.settings.training)
+    assert numbers.tolist() == [0, 1, -1, 2, 3, 4, -1, 5]
+    field = load_field(train_tile(job, Gradient(), tmp_path).folder)
+    assert len(field.image_embedding.weight) == 6
 
 
 def test_drawn_pixels_match_their_image_and_show_nothing_dynamic():

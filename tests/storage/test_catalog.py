@@ -1,65 +1,28 @@
-"""The catalog keeps what it was told, from however many processes, in either database it runs on.
-
-Set PRESIGHT_TEST_POSTGRES to the SQLAlchemy URL of an empty PostgreSQL database to run everything there too.
-"""
+"""The catalog keeps what it was told, from however many processes, in either database it runs on."""
 
 import multiprocessing
 import os
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import datetime, timedelta, timezone
 
 import pytest
 
 from presight_core.drives import Drive, Reject
 from presight_core.errors import ConflictError, InputError, MissingDependencyError, NotFoundError, StoreError
 from presight_core.progress import Progress
-from presight_core.recipes import Recipe
 from presight_core.tiles import Tile, Tiling
 from storage.catalog import Catalog
-from storage.database import SqlalchemyDatabase
 from storage.migrations import HEAD
-
-POSTGRES = os.environ.get("PRESIGHT_TEST_POSTGRES", "")
-ENGINES = ["sqlite", "sqlite by sqlalchemy", *(["postgres"] if POSTGRES else [])]
+from tests.storage.catalogs import RECIPE, Clock
 
 DRIVE = Drive("0123456789abcdef", "scene-0001", "toytown", "/data", "v1.0-mini", "2020-09-13", 8, 10**15, 2 * 10**15)
 OTHER = replace(DRIVE, drive_id="fedcba9876543210", name="scene-0002", city="othertown", start_us=1)
 REJECT = Reject("image-missing", "/data/a.jpg", "no such file", "extract it", "scene-0001")
-RECIPE = Recipe("training", 1, {"steps": 10}, {"drives": ["0123456789abcdef"]})
 TILING = Tiling("tiling-1", "toytown", (Tile("t000", (0.1, -1e6)), Tile("t001", (1 / 3, 2.0))))
-
-
-class Clock:
-    """A clock that moves a second at every look."""
-
-    def __init__(self) -> None:
-        self.now = datetime(2026, 11, 22, 6, 15, tzinfo=UTC)
-
-    def __call__(self) -> datetime:
-        self.now += timedelta(seconds=1)
-        return self.now
-
-
-def empty_postgres() -> str:
-    with SqlalchemyDatabase(POSTGRES).writing() as query:
-        query("DROP SCHEMA public CASCADE")
-        query("CREATE SCHEMA public")
-    return POSTGRES
-
-
-@pytest.fixture(params=ENGINES)
-def url(request, tmp_path) -> str:
-    places: dict[str, Callable[[], str]] = {
-        "sqlite": lambda: f"sqlite:///{tmp_path}/catalog.sqlite",
-        "sqlite by sqlalchemy": lambda: f"sqlite+pysqlite:///{tmp_path}/catalog.sqlite",
-        "postgres": empty_postgres,
-    }
-    return places[request.param]()
 
 
 @pytest.fixture
@@ -248,11 +211,11 @@ def add_from_a_process(url: str, number: int) -> bool:
 
 
 @pytest.mark.slow
-def test_processes_make_and_fill_a_catalog_together(url):
+def test_processes_make_and_fill_a_catalog_together(new_url):
     with multiprocessing.get_context("spawn").Pool(4) as pool:
-        added = pool.starmap(add_from_a_process, [(url, number) for number in range(8)])
+        added = pool.starmap(add_from_a_process, [(new_url, number) for number in range(8)])
     assert added.count(True) == 1
-    assert len(Catalog.open(url).drives("toytown")) == 8
+    assert len(Catalog.open(new_url).drives("toytown")) == 8
 
 
 def test_an_open_catalog_survives_a_fork(catalog):

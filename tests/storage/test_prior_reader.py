@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import pickle
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ import pytest
 
 from presight_core import frames
 from presight_core.errors import InputError, NotFoundError, StoreError
-from presight_core.priors import PriorReader
+from presight_core.priors import PriorReader, schema
+from presight_core.priors.documents import encode
+from presight_core.priors.location import ReadLocation
 from presight_core.priors.schema import VoxelBatch, array_specs, unpack_columns, unpack_voxels
 
 RANGES = {"x_m": (-12.0, 9.0), "y_m": (-7.0, 5.0), "z_m": (-1.0, 4.0)}
@@ -114,21 +117,101 @@ def test_a_pinned_reader_does_not_see_later_generations(town):
     assert town.reader(generation=1).tiles == ("t000",)
 
 
-def test_only_chunks_of_the_needed_rows_are_read(town, monkeypatch):
-    table = town.reader().tile("t000")
-    wanted = np.array([3, 4, 500])
-    expected = table.all_rows("hits")[wanted]
+def read_paths(reader: PriorReader, monkeypatch) -> list[str]:
+    """The objects that the reader's source is asked for from now on."""
     asked = []
-    monkeypatch.setattr("presight_core.priors.reader._chunk_runs", lambda rows, chunk: iter(asked))
-    asked[:] = [(0, 8), (496, 504)]  # as if chunks had 8 rows
+    read = ReadLocation.read
+    monkeypatch.setattr(ReadLocation, "read", lambda source, path: asked.append(path) or read(source, path))
+    return asked
+
+
+def test_only_chunks_of_the_needed_rows_are_read(empty_town, monkeypatch):
+    monkeypatch.setattr(schema, "CHUNK_ROWS", 8)
+    publish_first(empty_town)
+    table = empty_town.reader().tile("t000")
+    asked = read_paths(empty_town.reader(), monkeypatch)
+    wanted = np.array([3, 4, 500])
+    expected = np.concatenate([batch.hits for batch in empty_town.example.batches()])[wanted]
     np.testing.assert_array_equal(table.rows("hits", wanted), expected)
+    assert [path.partition("hits/")[2] for path in asked] == ["c/0", "c/62"]
 
 
-def test_chunk_runs_join_neighbours_and_skip_gaps():
-    from presight_core.priors.reader import _chunk_runs
+def publish_first(town) -> None:
+    town.store.publish("town", {"t000": town.write("t000", "build-1")}, None, town.tiling)
 
-    assert list(_chunk_runs(np.array([1, 9, 10, 17, 50]), 8)) == [(0, 24), (48, 56)]
-    assert list(_chunk_runs(np.array([], np.int64), 8)) == []
+
+def test_looks_are_read_only_where_voxels_are_inside(empty_town, monkeypatch):
+    monkeypatch.setattr(schema, "FEATURE_CHUNK_ROWS", 8)
+    monkeypatch.setattr(schema, "NARROW_BYTES", 4)  # so that features of 8 channels are cut finely
+    publish_first(empty_town)
+    reader = empty_town.reader()
+    asked = read_paths(reader, monkeypatch)
+    window = reader.window(POSES["level"], (-4, 4), (-4, 4), (-90, 90))
+    chunks = [path for path in asked if "/features/" in path]
+    assert 0 < len(chunks) <= len(window)
+
+
+def test_a_window_read_again_comes_from_memory(town, monkeypatch):
+    reader = town.reader()
+    expected = reader.window(POSES["level"])
+    asked = read_paths(reader, monkeypatch)
+    np.testing.assert_array_equal(reader.window(POSES["level"]).features, expected.features)
+    assert asked == []
+
+
+def test_memory_of_decoded_chunks_is_bounded(empty_town, monkeypatch):
+    monkeypatch.setattr(schema, "CHUNK_ROWS", 64)
+    publish_first(empty_town)
+    reader = PriorReader.open(empty_town.location, "town", cache_bytes=4000)
+    random = np.random.default_rng(0)
+    for _ in range(30):
+        reader.window(frames.planar_transform(*random.uniform(-20, 20, 2), 0.0), (-5, 5), (-5, 5))
+        assert reader._cache.size_bytes <= 4000
+    assert reader._cache.size_bytes > 2000
+
+
+def test_without_a_cache_a_window_is_the_same(town):
+    reader = PriorReader.open(town.location, "town", cache_bytes=0)
+    np.testing.assert_array_equal(reader.window(POSES["tilted"]).hits, town.reader().window(POSES["tilted"]).hits)
+    assert reader._cache.size_bytes == 0
+
+
+def test_batched_windows_equal_single_ones(town):
+    reader = town.reader()
+    for window, pose in zip(reader.windows(list(POSES.values()), **RANGES), POSES.values(), strict=True):
+        np.testing.assert_array_equal(window.points_world, reader.window(pose, **RANGES).points_world)
+    assert reader.windows([]) == []
+
+
+def test_batched_windows_of_a_remote_store_are_fetched_together(town, monkeypatch):
+    batches = []
+    read_all = ReadLocation.read_all
+    monkeypatch.setattr(ReadLocation, "is_remote", True)
+    monkeypatch.setattr(
+        ReadLocation, "read_all", lambda source, paths: batches.append(len(paths)) or read_all(source, paths)
+    )
+    reader = town.reader()
+    windows = reader.windows(list(POSES.values()), **RANGES)
+    assert [size for size in batches if size] == [1, 1, 1, 6]  # three block tables, then all voxel arrays at once
+    monkeypatch.undo()
+    for window, pose in zip(windows, POSES.values(), strict=True):
+        np.testing.assert_array_equal(window.hits, town.reader().window(pose, **RANGES).hits)
+
+
+def test_a_window_tells_which_tile_was_never_built(town):
+    """Of the tiling's three tiles, at x = 0, 100 and 200 m, only the first is published."""
+    assert town.reader().window(POSES["level"], (-5, 5), (-5, 5)).missing_tiles == ()
+    far = frames.planar_transform(60.0, 0.0, 0.0)
+    assert town.reader().window(far, (-20, 20), (-5, 5)).missing_tiles == ("t001",)
+    assert town.reader().window(far, (-20, 120), (-5, 5)).missing_tiles == ("t001", "t002")
+
+
+def test_a_tag_opens_the_generation_that_it_names(town):
+    town.store.tag("town", "release", 1)
+    town.store.publish("town", {"t001": town.write("t001", "build-1")}, 1)
+    assert PriorReader.open(town.location, "town", "release").generation.number == 1
+    with pytest.raises(NotFoundError, match="no tag elsewhere"):
+        PriorReader.open(town.location, "town", "elsewhere")
 
 
 @pytest.mark.parametrize(
@@ -168,9 +251,48 @@ def test_tiles_of_two_feature_spaces_are_refused(town):
     def mix(document: dict) -> None:
         document["tiles"]["t000"]["entry"]["space_id"] = "space-2"
 
-    edit_json(town.location / "town/generations/00000001.json", mix)
+    file = town.location / "town/generations/00000001.json"
+    edit_json(file, mix)
+    file.write_bytes(encode({key: value for key, value in json.loads(file.read_text()).items() if key != "sha256"}))
     with pytest.raises(StoreError, match="different feature spaces"):
         town.reader()
+
+
+def test_an_edited_generation_is_refused(town):
+    edit_json(town.location / "town/generations/00000001.json", lambda document: document.update(parent=7))
+    with pytest.raises(StoreError, match="seal is broken"):
+        town.reader()
+
+
+def test_a_generation_under_another_number_is_refused(town):
+    generations = town.location / "town/generations"
+    (generations / "00000002.json").write_bytes((generations / "00000001.json").read_bytes())
+    with pytest.raises(StoreError, match="holds generation 1 of town"):
+        town.reader()
+
+
+def test_an_edited_group_document_is_refused(town):
+    edit_json(town.location / "town/tiles/t000/build-1/zarr.json", lambda document: document.update(more=1))
+    with pytest.raises(StoreError, match="not the document that was published"):
+        town.reader().tile("t000")
+
+
+def test_a_missing_tile_says_so(town):
+    shutil.rmtree(town.location / "town/tiles/t000/build-1")
+    with pytest.raises(StoreError, match="the tile's data is missing"):
+        town.reader().window(POSES["level"])
+
+
+def test_two_chunks_that_changed_places_are_an_error(empty_town, monkeypatch):
+    """Both are whole, and their own checksums are right."""
+    monkeypatch.setattr(schema, "CHUNK_ROWS", 64)
+    publish_first(empty_town)
+    folder = empty_town.location / "town/tiles/t000/build-1/hits/c"
+    first, second = (folder / "0").read_bytes(), (folder / "1").read_bytes()
+    (folder / "0").write_bytes(second)
+    (folder / "1").write_bytes(first)
+    with pytest.raises(StoreError, match="holds another chunk"):
+        empty_town.reader().tile("t000").all_rows("hits")
 
 
 def edit_json(file: Path, change) -> None:
@@ -185,7 +307,7 @@ def test_a_flipped_bit_is_found_on_read(town, name: str):
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 4
     chunk.write_bytes(content)
-    with pytest.raises(StoreError, match=f"{name} is damaged|build-1 is damaged"):
+    with pytest.raises(StoreError, match=f"{name}/c/.* is damaged"):
         town.reader().window(POSES["level"])
 
 
@@ -198,7 +320,7 @@ def test_every_array_carries_a_checksum(town):
 def test_a_lost_chunk_is_an_error_and_not_an_empty_road(town):
     for chunk in (town.location / "town/tiles/t000/build-1/hits/c").iterdir():
         chunk.unlink()
-    with pytest.raises(StoreError, match=r"hits is damaged.*missing"):
+    with pytest.raises(StoreError, match=r"hits/c/0 is missing"):
         town.reader().window(POSES["level"])
 
 

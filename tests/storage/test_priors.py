@@ -10,6 +10,7 @@ import pytest
 
 from presight_core.errors import ConflictError, InputError, NotFoundError, StoreError
 from presight_core.grid import Lattice, morton
+from presight_core.priors import schema
 from presight_core.priors.documents import GenerationTile
 from presight_core.priors.schema import array_specs
 from storage import tile_groups
@@ -34,19 +35,34 @@ def test_a_tile_is_sorted_by_block_and_voxel(town):
     assert rows == sorted(set(rows))
 
 
-def test_slabs_do_not_change_what_is_stored(empty_town, monkeypatch):
+@pytest.mark.parametrize("chunk_rows", [7, 64])
+def test_chunks_and_slabs_do_not_change_what_is_stored(empty_town, monkeypatch, chunk_rows: int):
     whole = empty_town.write("t000", "build-1")
-    monkeypatch.setattr(tile_groups._ArrayWriter, "append", append_in_small_slabs(tile_groups._ArrayWriter.append))
+    monkeypatch.setattr(schema, "CHUNK_ROWS", chunk_rows)
+    monkeypatch.setattr(schema, "BLOCK_CHUNK_ROWS", 5)
+    monkeypatch.setattr(tile_groups, "SLAB_CHUNKS", 2)
     pieces = empty_town.write("t000", "build-2")
+    monkeypatch.undo()  # readers take the chunks' size from the store
     assert pieces.entry.digest == whole.entry.digest
+    empty_town.store.publish("town", {"t000": whole}, None, empty_town.tiling)
+    empty_town.store.publish("town", {"t000": pieces}, 1)
+    expected, window = (empty_town.reader(number).window(np.eye(4)) for number in (1, 2))
+    np.testing.assert_array_equal(window.features, expected.features)
+    np.testing.assert_array_equal(window.points_world, expected.points_world)
 
 
-def append_in_small_slabs(append):
-    def small(writer, rows):
-        writer.slab_rows = 7
-        append(writer, rows)
+@pytest.mark.parametrize("step", [1, 3, 5])
+def test_features_are_kept_to_within_half_a_step(tmp_path: Path, step: int):
+    features = np.arange(256, dtype=np.uint8)[:, None]
+    found = schema.unpack_features(schema.pack_features(features, step), step)
+    assert np.abs(found.astype(int) - features).max() == step // 2
+    assert found[0] == 0
+    assert found[-1] == 255
 
-    return small
+
+def test_a_feature_step_that_does_not_divide_255_is_refused(empty_town):
+    with pytest.raises(InputError, match="does not divide 255"):
+        empty_town.store.create_city("other", Lattice(), "space-1", 8, feature_step=4)
 
 
 def test_the_digest_names_the_content(empty_town):
@@ -270,3 +286,71 @@ def test_a_store_can_be_a_file_url(tmp_path: Path):
 def test_a_location_that_cannot_be_written_is_a_store_error(location: str):
     with pytest.raises(StoreError, match=location):
         PriorStore.open(location)
+
+
+def test_a_publisher_with_an_older_fencing_number_is_refused_and_changes_nothing(town):
+    store = town.store
+    store.publish("town", {"t001": town.write("t001", "build-1")}, 1, fence=7)
+    with pytest.raises(ConflictError, match="fencing number 7, this run 6"):
+        store.publish("town", {"t002": town.write("t002", "build-1")}, 1, fence=6)
+    assert store.generations("town") == [1, 2]
+    assert store.fence("town") == 7
+
+
+def test_the_fence_outlives_publishers_that_have_none(town):
+    town.store.raise_fence("town", 5)
+    town.store.publish("town", {"t001": town.write("t001", "build-1")}, 1)
+    assert town.store.fence("town") == 5
+
+
+def test_the_fence_outlives_a_rollback(town):
+    town.store.raise_fence("town", 5)
+    town.store.rollback("town", 1)
+    assert town.store.fence("town") == 5
+
+
+def test_raising_the_fence_shows_the_same_tiles_and_is_done_once(town):
+    town.store.raise_fence("town", 5)
+    town.store.raise_fence("town", 5)
+    first, second = (town.store.generation("town", number) for number in (1, 2))
+    assert town.store.generations("town") == [1, 2]
+    assert second == replace(first, number=2, parent=1, parent_sha256=second.parent_sha256, fence=5)
+    with pytest.raises(ConflictError, match="may no longer publish"):
+        town.store.raise_fence("town", 4)
+
+
+def test_a_publisher_that_is_about_to_put_when_the_fence_rises_is_refused(town, monkeypatch):
+    """It has read generation 1 and made number 2 of it; somebody raises the fence; then it goes on."""
+    tile = town.write("t001", "build-1")
+    commit = PriorStore._commit
+
+    def late(store, generation):
+        monkeypatch.setattr(PriorStore, "_commit", commit)
+        town.store.raise_fence("town", 2)
+        return commit(store, generation)
+
+    monkeypatch.setattr(PriorStore, "_commit", late)
+    with pytest.raises(ConflictError, match="taken for dead"):
+        town.store.publish("town", {"t001": tile}, 1, fence=1)
+    final = town.store.generation("town")
+    assert final is not None
+    assert (final.number, sorted(final.tiles)) == (2, ["t000"])
+
+
+def test_a_city_without_generations_can_be_fenced_and_then_published(empty_town):
+    store = empty_town.store
+    store.raise_fence("unknown-city", 3)  # nothing to fence
+    store.raise_fence("town", 3)
+    tile = empty_town.write("t000", "build-1")
+    with pytest.raises(ConflictError):
+        store.publish("town", {"t000": tile}, None, empty_town.tiling, fence=2)
+    assert store.publish("town", {"t000": tile}, None, empty_town.tiling, fence=3) == 2
+    assert len(empty_town.reader().tiles) == 1
+
+
+def test_a_generation_of_before_the_fence_reads_as_fence_0(town):
+    from presight_core.priors.documents import Generation
+
+    document = json.loads((town.location / "town/generations/00000001.json").read_text())
+    del document["fence"]
+    assert Generation.from_json(document).fence == 0

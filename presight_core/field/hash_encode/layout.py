@@ -59,8 +59,12 @@ def grid_layout(settings: GridSettings, sub_field_count: int = 1, dense_coarse: 
 
 
 def level_resolutions(settings: GridSettings) -> tuple[int, ...]:
-    """Cells along an edge for each level, a geometric series from the smallest to the largest resolution."""
+    """Cells along an edge for each level, a geometric series from the smallest to the largest resolution.
+
+    Each power is rounded to float32 before the product is floored, as in nerfstudio, so that tables mean the
+    same in both: the largest may lose a cell (4095 of 4096 with 8 levels), and does so on every machine.
+    """
     steps = max(settings.levels - 1, 1)
-    growth = (settings.max_resolution / settings.min_resolution) ** (1 / steps)
-    # The tiny excess keeps exact powers, computed a hair too small, from falling to the integer below.
-    return tuple(int(settings.min_resolution * growth**level * (1 + 1e-9)) for level in range(settings.levels))
+    growth = np.exp((np.log(settings.max_resolution) - np.log(settings.min_resolution)) / steps)
+    powers = np.float64(np.float32(growth)) ** np.arange(settings.levels)
+    return tuple(int(cells) for cells in np.float32(settings.min_resolution) * powers.astype(np.float32))

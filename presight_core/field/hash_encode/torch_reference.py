@@ -1,4 +1,4 @@
-"""The hash encoding in plain torch: the oracle of the fast kernels, and the backend where none exists."""
+"""The hash encoding in plain torch: the oracle of the fast kernels."""
 
 import torch
 from torch import Tensor
@@ -17,10 +17,12 @@ def encode(points: Tensor, segments: Tensor, table: Tensor, offsets: Tensor, lev
     return torch.cat(outputs, -1)
 
 
-def table_gradient(points: Tensor, segments: Tensor, gradient: Tensor, offsets: Tensor, levels: Tensor) -> Tensor:
-    """Gradient (rows, features) of the table for the gradient (N, levels * features) of the output."""
+def table_gradient(
+    points: Tensor, segments: Tensor, gradient: Tensor, offsets: Tensor, levels: Tensor, row_count: int
+) -> Tensor:
+    """Gradient (row_count, features) of the table for the gradient (N, levels * features) of the output."""
     features = gradient.shape[1] // len(levels)
-    result = gradient.new_zeros(int(offsets[-1, -1] + levels[-1, 1]), features)
+    result = gradient.new_zeros(row_count, features)
     for level in range(len(levels)):
         rows, fraction = _locate(points, segments, offsets, levels, level)
         upstream = gradient[:, level * features : (level + 1) * features]
