@@ -6,8 +6,10 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from flows import store_commands
 from flows.feature_commands import features
 from flows.model_commands import models
+from flows.options import AsJson, City
 from presight_core.errors import MissingDependencyError, PresightError, StoreError
 
 app = typer.Typer(
@@ -23,10 +25,6 @@ app.add_typer(models, name="models")
 catalog_commands = typer.Typer(help="Look after the catalog.", no_args_is_help=True)
 app.add_typer(catalog_commands, name="catalog")
 
-City = Annotated[
-    str, typer.Argument(help="City: the log location, for example singapore-onenorth.", show_default=False)
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, for example training.steps=2000."),
@@ -193,6 +191,9 @@ def doctor(context: typer.Context, as_json: AsJson = False) -> None:
     from flows.doctor import show_findings
 
     show_findings(context.obj, as_json)
+
+
+app.add_typer(store_commands.app)
 
 
 def main() -> None:

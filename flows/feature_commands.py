@@ -4,12 +4,13 @@ from typing import Annotated
 
 import typer
 
+from flows.options import AsJson, City
+
 features = typer.Typer(help="Fit the shared feature space, and look at features.", no_args_is_help=True)
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, for example features.channels=32."),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
 
 
 @features.command()
@@ -43,7 +44,7 @@ def show(
 @features.command()
 def report(
     context: typer.Context,
-    city: Annotated[str, typer.Argument(help="City.", show_default=False)],
+    city: City,
     override: Overrides = None,
     as_json: AsJson = False,
 ) -> None:

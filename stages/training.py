@@ -16,18 +16,18 @@ from presight_core.config import CitySettings, TrainingSettings
 from presight_core.drives import FrameTable
 from presight_core.errors import BuildError, InputError, NotFoundError
 from presight_core.field import checkpoint, losses, schedule, threads
-from presight_core.field.tile_field import FieldShape, Rays, Rendering, Sampling, TileField
+from presight_core.field.rays import Rays
+from presight_core.field.tile_field import FieldShape, Rendering, Sampling, TileField
 from presight_core.pixels import PixelSource
 from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import Recipe
 from presight_core.tiles import SubField
 from stages import versions
+from stages.feeding import Feed
 from stages.ground import Ground, Stretches
-from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
+from stages.ray_pool import PixelBatch
 
 REPORT_SECONDS = 0.5
-POOL_BYTES = 3 << 30  # of decoded images in memory
-POOL_STEPS = 250  # a pool that cannot hold all images is drawn anew this often (released code: about 280)
 PULSE_WIDTHS = (0.03, 0.003)  # of the blurred interlevel loss, coarse proposal first (released code)
 
 
@@ -62,7 +62,10 @@ class TileTraining:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Where the field lies (see `load_field`), and loss, psnr_db and rays_per_s of the end of training."""
+    """Where the field lies (see `load_field`), and figures of the end of training.
+
+    loss, psnr_db, rays_per_s, and waiting_share: of the time, how much was spent waiting for batches.
+    """
 
     folder: Path
     metrics: dict[str, float]
@@ -83,21 +86,17 @@ def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Re
     run = Run(job, scratch)
     if run.step < job.settings.training.steps:
         report(Progress("training", run.step, job.settings.training.steps))
-        pools = _Pools(job, source, rows)
-        with _Log(job, scratch, report) as log:
-            _train(job, run, pools, log)
+        with _Log(job, scratch, report) as log, Feed(job, source, rows) as feed:
+            _train(job, run, feed, log)
     checkpoint.save_field(scratch / "field", run.field)
     return TrainingResult(scratch / "field", run.metrics)
 
 
-def _train(job: TileTraining, run: "Run", pools: "_Pools", log: "_Log") -> None:
+def _train(job: TileTraining, run: "Run", feed: Feed, log: "_Log") -> None:
     """All steps that are left."""
-    settings, dynamic = job.settings.training, job.settings.features.dynamic_classes
+    settings = job.settings.training
     for step in range(run.step, settings.steps):
-        pool, groups = pools.at(step)
-        random = np.random.default_rng([settings.seed, step])
-        batch = draw_static(pool, settings.batch_rays, groups, random, dynamic, settings.thin_weight)
-        log.add(step, run.train(step, batch))
+        log.add(step, run.train(step, feed.batch(step)), feed.waited_s)
         if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
             log.flush(step)
             run.save(step + 1, log.figures)
@@ -151,41 +150,6 @@ def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.i
     """The rows in use, and which of them are held out."""
     rows = np.flatnonzero(frames.is_keyframe) if settings.keyframes_only else np.arange(len(frames))
     return rows, holdout_mask(frames.select(rows), settings.holdout_every)
-
-
-class _Pools:
-    """The pool of each step: all images if they fit into memory, else a random part that changes now and then."""
-
-    def __init__(self, job: TileTraining, source: PixelSource, rows: NDArray[np.int64]) -> None:
-        self._job, self._source, self._rows = job, source, rows
-        centroids = np.array([sub_field.centroid_m for sub_field in job.sub_fields])
-        offsets = job.frames.positions[rows][:, None] - centroids[None]
-        self._sub_field = np.linalg.norm(offsets, axis=-1).argmin(-1)
-        self._capacity = max(1, POOL_BYTES // bytes_of(source.load(int(rows[0]))))
-        self._epoch = -1
-
-    def at(self, step: int) -> tuple[RayPool, list[NDArray[np.int64]]]:
-        """The pool of a step, and its images grouped by sub-field."""
-        epoch = 0 if len(self._rows) <= self._capacity else step // POOL_STEPS
-        if epoch != self._epoch:
-            self._epoch = epoch
-            chosen = self._choose(epoch)
-            self._pool = RayPool(self._job.frames, self._source, self._rows[chosen], self._job.threads)
-            owner = self._sub_field[chosen]
-            self._groups = [np.flatnonzero(owner == sub_field) for sub_field in np.unique(owner)]
-        return self._pool, self._groups
-
-    def _choose(self, epoch: int) -> NDArray[np.int64]:
-        """Places in `rows` of the pool's images, as many of each sub-field as there is room for."""
-        if len(self._rows) <= self._capacity:
-            return np.arange(len(self._rows))
-        random = np.random.default_rng([self._job.settings.training.seed, epoch, 1])  # 1: apart from the steps'
-        order = random.permutation(len(self._rows))
-        rank = np.empty(len(order), np.int64)  # how many of its sub-field come before each
-        for sub_field in np.unique(self._sub_field):
-            places = np.flatnonzero(self._sub_field[order] == sub_field)
-            rank[places] = np.arange(len(places))
-        return np.sort(order[np.argsort(rank, kind="stable")[: self._capacity]])
 
 
 class Run:
@@ -316,6 +280,7 @@ class _Log:
         self._writer = SummaryWriter(scratch / "tensorboard")
         self._sums: dict[str, Tensor] = {}
         self._steps = 0
+        self._waited_s = self._waited_before_s = 0.0  # for batches, in all; up to the last report
         self._started = time.perf_counter()
 
     def __enter__(self) -> "_Log":
@@ -324,8 +289,9 @@ class _Log:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
-    def add(self, step: int, parts: dict[str, Tensor]) -> None:
-        """Note a step's losses; every half second they are reported."""
+    def add(self, step: int, parts: dict[str, Tensor], waited_s: float) -> None:
+        """Note a step's losses, and how long all steps waited for batches; every half second they are reported."""
+        self._waited_s = waited_s
         for name, part in parts.items():
             self._sums[name] = self._sums.get(name, torch.zeros_like(part)) + part
         self._steps += 1
@@ -345,7 +311,13 @@ class _Log:
                 f"tile {self._job.tile_id}: the loss is {loss} at step {step}; lower training.learning_rate ({rate})"
             )
         rays_per_s = self._steps * self._job.settings.training.batch_rays / seconds
-        self.figures = {"loss": loss, "psnr_db": -10 * float(np.log10(means["rgb"])), "rays_per_s": rays_per_s}
+        self.figures = {
+            "loss": loss,
+            "psnr_db": -10 * float(np.log10(means["rgb"])),
+            "rays_per_s": rays_per_s,
+            "waiting_share": (self._waited_s - self._waited_before_s) / seconds,
+        }
+        self._waited_before_s = self._waited_s
         for name, value in {**{f"loss/{name}": mean for name, mean in means.items()}, **self.figures}.items():
             self._writer.add_scalar(name, value, step + 1)
         self._report(Progress("training", step + 1, self._job.settings.training.steps, dict(self.figures)))

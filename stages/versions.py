@@ -5,4 +5,4 @@ A raised number makes every tile built with the old one stale.
 
 FEATURES = 2
 TRAINING = 2
-EXTRACTION = 1
+EXTRACTION = 2

@@ -9,6 +9,9 @@ Edges = Float[Tensor, "rays edges"]
 Weights = Float[Tensor, "rays bins"]
 
 
+GROUND_SLACK = 0.1  # see `ground_loss`
+
+
 def feature_loss(rendered: Tensor, target: Tensor) -> Tensor:
     """Mean squared error of features; the target is clipped to [0, 1], the range of the feature space."""
     return functional.mse_loss(rendered, target.clamp(0, 1))
@@ -24,10 +27,12 @@ def sky_loss(accumulation: Float[Tensor, " rays"], is_sky: Bool[Tensor, " rays"]
 def ground_loss(
     weights: Weights, middles_m: Float[Tensor, "rays bins"], start_m: Float[Tensor, " rays"]
 ) -> Float[Tensor, ""]:
-    """Negative logarithm of the weight beyond `start_m`, mean over rays; rays that start at 0 cost nothing."""
+    """Negative logarithm of the weight beyond `start_m`, mean over rays; rays that start at 0 cost nothing.
+
+    A tenth is added to the weight, so that a pixel with a wrong label pulls ten times as hard as a right one at most.
+    """
     beyond = (weights * (middles_m > start_m[:, None])).sum(-1)
-    # Below a thousandth the slope would be steeper than is good for a step.
-    return torch.where(start_m > 0, -beyond.clamp(1e-3, 1).log(), 0).mean()
+    return torch.where(start_m > 0, -((beyond + GROUND_SLACK) / (1 + GROUND_SLACK)).log(), 0).mean()
 
 
 def distortion_loss(edges: Edges, weights: Weights) -> Tensor:

@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from presight_core.config import FieldSettings, GridSettings, SamplingSettings
 from presight_core.field import rendering, samplers
 from presight_core.field.assignment import Assignment, assign
-from presight_core.field.contraction import grid_position
+from presight_core.field.contraction import grid_position, grid_positions
+from presight_core.field.early_stop import weights_until
 from presight_core.field.hash_grid import HashGrid
 from presight_core.field.mlp import SubFieldMlp
+from presight_core.field.rays import Rays
 from presight_core.field.spherical_harmonics import HARMONICS, spherical_harmonics
 from presight_core.tiles import SubField
 
@@ -57,22 +59,6 @@ class FieldShape:
 
 
 @dataclass(frozen=True)
-class Rays:
-    """Rays in the field frame. Without videos or images the mean of all their embeddings is used."""
-
-    origins: Float[Tensor, "rays 3"]
-    directions: Float[Tensor, "rays 3"]  # unit length
-    videos: Int[Tensor, " rays"] | None = None
-    images: Int[Tensor, " rays"] | None = None
-    ends_m: Float[Tensor, " rays"] | None = None  # nothing lies beyond; None or inf: the far plane
-
-    def points(self, edges_m: Float[Tensor, "rays edges"]) -> Float[Tensor, "rays samples 3"]:
-        """The middle of each stretch between two edges."""
-        middles = (edges_m[:, 1:] + edges_m[:, :-1]) / 2
-        return self.origins[:, None] + middles[..., None] * self.directions[:, None]
-
-
-@dataclass(frozen=True)
 class Histogram:
     """Where rays end: weights of the stretches between edges, which are in s (see samplers)."""
 
@@ -87,6 +73,7 @@ class Sampling:
     generator: torch.Generator | None = None  # None: no jitter
     anneal: float = 1.0  # exponent of the proposals' weights; below 1 they are flattened
     train_proposals: bool = False
+    left: float = 0.0  # a ray is followed until this share of it is left; the proposals' samples beyond weigh nothing
 
 
 @dataclass(frozen=True)
@@ -122,9 +109,9 @@ class DensityNetwork(nn.Module):
         self.grid = HashGrid(grid, sub_field_count)
         self.network = SubFieldMlp(sub_field_count, (self.grid.output_width, width, outputs))
 
-    def forward(self, positions: Tensor, assignment: Assignment) -> Tensor:
-        """Outputs (N, outputs) at positions (N, 3) of the grids, sorted by sub-field."""
-        return self.network(self.grid(positions, assignment.segments), assignment)
+    def forward(self, positions: Tensor, assignment: Assignment, outputs: int | None = None) -> Tensor:
+        """The first `outputs` (N, outputs), or all, at positions (N, 3) of the grids, sorted by sub-field."""
+        return self.network(self.grid(positions, assignment.segments), assignment, outputs)
 
 
 class TileField(nn.Module):
@@ -231,8 +218,7 @@ class TileField(nn.Module):
         for proposal, count in zip(self.proposals, counts[1:], strict=True):
             edges_m = spacing.metres(edges)
             with torch.set_grad_enabled(sampling.train_proposals and torch.is_grad_enabled()):
-                density = self._density(proposal, rays.points(edges_m))
-                weights = rendering.ray_weights(density, edges_m.diff(dim=-1))
+                weights = self._weights(proposal, rays, edges_m, sampling.left)
             histograms.append(Histogram(edges, weights))
             flattened = weights.detach() ** sampling.anneal
             jitter, padding = self._jitter(rays, sampling), self.shape.sampling.padding
@@ -258,6 +244,12 @@ class TileField(nn.Module):
             assignment.restore(features).float().unflatten(0, shape),
         )
 
+    def weights(
+        self, rays: Rays, edges_m: Float[Tensor, "rays edges"], left: float = 0.0
+    ) -> Float[Tensor, "rays bins"]:
+        """Share of each ray that ends between its edges; nothing beyond where at most `left` of the ray is left."""
+        return self._weights(self.trunk, rays, edges_m, left)
+
     def density(self, points: Float[Tensor, "rays samples 3"]) -> Float[Tensor, "rays samples"]:
         """Density per metre at points."""
         return self._density(self.trunk, points)
@@ -274,9 +266,14 @@ class TileField(nn.Module):
         ]
         return torch.cat([spherical_harmonics(rays.directions), *embeddings], -1)
 
+    def _weights(self, network: nn.Module, rays: Rays, edges_m: Tensor, left: float) -> Tensor:
+        if left:
+            return weights_until(lambda points: self._density(network, points), rays, edges_m, left)
+        return rendering.ray_weights(self._density(network, rays.points(edges_m)), edges_m.diff(dim=-1))
+
     def _density(self, network: nn.Module, points: Tensor) -> Tensor:
         assignment, positions, inside = self._locate(points)
-        density = network(positions, assignment)[:, 0]
+        density = network(positions, assignment, 1)[:, 0]
         return assignment.restore(self._activate(density, inside)).view(points.shape[:-1])
 
     def _activate(self, output: Tensor, inside: Tensor) -> Tensor:
@@ -288,6 +285,9 @@ class TileField(nn.Module):
         """The sorting by sub-field of points (..., 3), their grid positions (N, 3), and which have one."""
         flat = points.reshape(-1, 3)
         assignment = assign(flat, self.centroids)
+        if points.device.type == "cpu" and not points.requires_grad:
+            boxes = assignment.segments, self.box_centre, self.box_half
+            return assignment, *grid_positions(assignment.sort(flat), *boxes)
         centre, half = assignment.spread(self.box_centre), assignment.spread(self.box_half)
         positions, inside = grid_position(assignment.sort(flat), centre, half)
         return assignment, positions, inside

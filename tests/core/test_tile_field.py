@@ -2,11 +2,12 @@ import json
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 from presight_core.config import FieldSettings, GridSettings, SamplingSettings
 from presight_core.errors import InputError, NotFoundError
-from presight_core.field.checkpoint import FIELD_FILE, load_field, save_field
+from presight_core.field.checkpoint import FIELD_FILE, load_field, load_tensors, save_field, save_tensors
 from presight_core.field.surface import find_surface
 from presight_core.field.tile_field import FieldShape, Sampling, TileField
 from presight_core.tiles import SubField
@@ -170,3 +171,12 @@ def test_no_rays_have_no_surface():
     seen = find_surface(small_field(), np.zeros((0, 3)), np.zeros((0, 3)), "first-hit")
     assert seen.features.shape == (0, 5)
     assert seen.points_world.shape == (0, 3)
+
+
+def test_a_saved_file_is_one_that_safetensors_reads(tmp_path):
+    tensors = {"a": torch.arange(6).view(2, 3), "b": torch.rand(3, 2).T, "step": torch.tensor(2.0)}
+    save_tensors(tmp_path / "state", tensors, {"step": 2})
+    found = safetensors.torch.load_file(tmp_path / "state")
+    assert set(found) == set(tensors)
+    assert all(torch.equal(found[name], tensors[name]) for name in tensors)
+    assert load_tensors(tmp_path / "state")[1] == {"step": 2}
