@@ -40,7 +40,7 @@ def open_tile(folder: Path, city: str, index: int, overrides: list[str], thread_
     assert plan.features is not None and plan.space_id is not None, f"{city}: build it first, for its features"
     frames = tile_frames(city_frames(workspace.drives(), plan.drives, settings), plan.tiling, index, settings)
     roots = {drive.drive_id: drive.root for drive in plan.drives}
-    source = CachedPixels(frames, roots, workspace.features(), plan.features.digest, settings.training.image_scale)
+    source = CachedPixels(frames, roots, workspace.features(), plan.features.digest, settings)
     channels = workspace.artifacts().space(plan.space_id).channel_count
     parts = sub_fields(frames.positions, settings.tiling)
     job = TileTraining(plan.tiling.tiles[index].tile_id, frames, parts, settings, channels, thread_count)

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from flows.options import AsJson, Overrides
+from flows.options import AsJson, City, Overrides
 
 features = typer.Typer(help="Fit the shared feature space, and look at features.", no_args_is_help=True)
 
@@ -40,7 +40,7 @@ def show(
 @features.command()
 def report(
     context: typer.Context,
-    city: Annotated[str, typer.Argument(help="City.", show_default=False)],
+    city: City,
     override: Overrides = None,
     as_json: AsJson = False,
 ) -> None:

@@ -6,4 +6,3 @@ A raised number makes every tile built with the old one stale.
 FEATURES = 2
 TRAINING = 3
 EXTRACTION = 2
-EXTRACTION = 2

@@ -159,11 +159,14 @@ def _rows_file(part: Path) -> Path:
 
 
 def _lines(part: Path) -> list[dict[str, Any]]:
-    """The lines of a group; a last line that a kill cut short does not count."""
+    """The lines of a group; a last line that a kill cut short does not count. Raises StoreError if one is damaged."""
     file = _rows_file(part)
     if not file.exists():
         return []
-    return [json.loads(text) for text in file.read_bytes().splitlines(keepends=True) if text.endswith(b"\n")]
+    try:
+        return [json.loads(text) for text in file.read_bytes().splitlines(keepends=True) if text.endswith(b"\n")]
+    except ValueError as error:
+        raise _damaged(file, f"a line cannot be read ({error})") from error
 
 
 class _Writer:
@@ -316,4 +319,4 @@ class _DriveLayers:
 
 
 def _damaged(path: Path, fact: str) -> StoreError:
-    return StoreError(f"{path}: {fact}; delete this folder, and the next build makes it again")
+    return StoreError(f"{path}: {fact}; delete this, and the next build makes it again")

@@ -109,6 +109,16 @@ def test_a_line_that_a_kill_cut_short_does_not_count(tmp_path):
     assert cache.write("key", "d0", FRAMES, ITEMS[1:]) == (REJECT,)
 
 
+def test_a_damaged_line_is_damage(tmp_path):
+    cache = FeatureCache(tmp_path)
+    with pytest.raises(AssertionError):
+        cache.write("key", "d0", FRAMES, ITEMS[:2])
+    lines = tmp_path / "key" / ".d0.jsonl"
+    lines.write_bytes(b"?" + lines.read_bytes())
+    with pytest.raises(StoreError, match="a line cannot be read"):
+        cache.missing_rows("key", "d0", 3)
+
+
 def test_two_writers_of_one_drive_do_not_meet(tmp_path):
     cache = FeatureCache(tmp_path)
 
@@ -151,7 +161,7 @@ def test_a_flipped_bit_in_compact_features_is_damage(tmp_path, place):
     content = bytearray(chunk.read_bytes())
     content[place] ^= 1
     chunk.write_bytes(content)
-    with pytest.raises(StoreError, match="delete this folder"):
+    with pytest.raises(StoreError, match="delete this, and the next build"):
         cache.read("key", "d0", 0)
 
 
@@ -180,7 +190,7 @@ def test_a_flipped_bit_is_damage(cache, tmp_path, array):
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
-    with pytest.raises(StoreError, match="delete this folder"):
+    with pytest.raises(StoreError, match="delete this, and the next build"):
         cache.read("key", "d0", 0)
 
 
