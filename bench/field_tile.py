@@ -6,17 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from flows.plan import CityPlan, city_frames, plan_city, tile_frames
 from presight_core.config import load_city_settings
 from presight_core.field.tile_field import TileField
 from presight_core.grid import Lattice
 from presight_core.pixels import PixelSource
 from stages.extraction import TileExtraction
-from stages.ray_pool import draw_static
+from stages.feeding import Feed
 from stages.tiling import sub_fields
-from stages.training import Run, TileTraining, _Pools, training_rows
+from stages.training import Run, TileTraining, training_rows
 from storage.pixels import CachedPixels
 from storage.workspace import Workspace
 
@@ -42,7 +40,7 @@ def open_tile(folder: Path, city: str, index: int, overrides: list[str], thread_
     assert plan.features is not None and plan.space_id is not None, f"{city}: build it first, for its features"
     frames = tile_frames(city_frames(workspace.drives(), plan.drives, settings), plan.tiling, index, settings)
     roots = {drive.drive_id: drive.root for drive in plan.drives}
-    source = CachedPixels(frames, roots, workspace.features(), plan.features.digest, settings.training.image_scale)
+    source = CachedPixels(frames, roots, workspace.features(), plan.features.digest, settings)
     channels = workspace.artifacts().space(plan.space_id).channel_count
     parts = sub_fields(frames.positions, settings.tiling)
     job = TileTraining(plan.tiling.tiles[index].tile_id, frames, parts, settings, channels, thread_count)
@@ -51,19 +49,17 @@ def open_tile(folder: Path, city: str, index: int, overrides: list[str], thread_
 
 def train(tile: BenchTile, marks: list[int]) -> Iterator[tuple[int, float, TileField]]:
     """The field after the steps of `marks` and at the end, with the processor minutes that training took so far."""
-    settings, dynamic = tile.job.settings.training, tile.job.settings.features.dynamic_classes
+    settings = tile.job.settings.training
     with tempfile.TemporaryDirectory() as scratch:
         run = Run(tile.job, Path(scratch))
-        pools = _Pools(tile.job, tile.source, training_rows(tile.job.frames, settings))
         spent, started = 0.0, time.process_time()
-        for step in range(settings.steps):
-            pool, groups = pools.at(step)
-            random = np.random.default_rng([settings.seed, step])
-            run.train(step, draw_static(pool, settings.batch_rays, groups, random, dynamic, settings.thin_weight))
-            if step + 1 in marks or step + 1 == settings.steps:
-                spent += time.process_time() - started
-                yield step + 1, spent / 60, run.field
-                started = time.process_time()
+        with Feed(tile.job, tile.source, training_rows(tile.job.frames, settings)) as feed:
+            for step in range(settings.steps):
+                run.train(step, feed.batch(step))
+                if step + 1 in marks or step + 1 == settings.steps:
+                    spent += time.process_time() - started
+                    yield step + 1, spent / 60, run.field
+                    started = time.process_time()
 
 
 def marks_of(text: str) -> list[int]:

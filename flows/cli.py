@@ -6,6 +6,10 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from flows import store_commands
+from flows.feature_commands import features
+from flows.model_commands import models
+from flows.options import AsJson, City, Overrides
 from presight_core.errors import MissingDependencyError, PresightError, StoreError
 
 app = typer.Typer(
@@ -16,19 +20,13 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+app.add_typer(features, name="features")
+app.add_typer(models, name="models")
 catalog_commands = typer.Typer(help="Look after the catalog.", no_args_is_help=True)
 app.add_typer(catalog_commands, name="catalog")
 drive_commands = typer.Typer(help="The drives of the cities.", no_args_is_help=True)
 app.add_typer(drive_commands, name="drives")
 
-City = Annotated[
-    str, typer.Argument(help="City: the log location, for example singapore-onenorth.", show_default=False)
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, for example training.steps=2000."),
-]
 Shown = Annotated[int | None, typer.Option("--generation", help="Generation to read; the newest if not given.")]
 
 
@@ -224,6 +222,9 @@ def doctor(context: typer.Context, as_json: AsJson = False) -> None:
     from flows.doctor import show_findings
 
     show_findings(context.obj, as_json)
+
+
+app.add_typer(store_commands.app)
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from flows.drives import CityDrives, choose_drives, require_split_apart
 from flows.staleness import Reason, stale_reasons
+from presight_core import masking
 from presight_core.config import CitySettings
 from presight_core.drives import Drive, FrameTable
 from presight_core.errors import InputError, NotFoundError
@@ -101,7 +102,7 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
     require_split_apart(city, workspace.drives(), known, settings.split)
     frames = city_frames(workspace.drives(), known.builders, settings) if known.builders else None
     city_tiling = _tiling(workspace, city, frames, generation, settings)
-    space_id = workspace.artifacts().pinned_space(space_key(settings))
+    space_id = settings.features.space or workspace.artifacts().pinned_space(space_key(settings))
     features = features_recipe(settings, space_id) if space_id else None
     past = {build.tile_id: build for build in catalog.builds(city, "published")}
     compare = partial(stale_reasons, known=known, index=workspace.drives())
@@ -209,7 +210,9 @@ def features_recipe(settings: CitySettings, space_id: str) -> Recipe:
         "feature_model": ModelCard.load(settings.features.feature_model, "features").identity,
         "space": space_id,
     }
-    chosen = {"masks": settings.features.masks, "keyframes_only": settings.training.keyframes_only}
+    features = settings.features
+    chosen = {"masks": features.masks, "cache": features.cache, "parked_cars": features.parked_cars}
+    chosen |= {"keyframes_only": settings.training.keyframes_only}
     return Recipe("features", versions.FEATURES, chosen, models)
 
 
@@ -251,6 +254,7 @@ def _recipes(
         "drives": np.unique(members.drive_id).tolist(),
         "features": features.to_json(),
         "dynamic_classes": list(settings.features.dynamic_classes),
+        "moving": masking.recipe(settings.features),
         "tile": city_tiling.tiles[tile].tile_id,
         "centroid_m": list(city_tiling.tiles[tile].centroid_m),
     }

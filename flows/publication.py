@@ -2,10 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from flows.drives import choose_drives
 from flows.jobs import Job
 from flows.plan import CityPlan
+from flows.reconcile import hold_city
+from presight_core.config import load_city_settings
+from presight_core.errors import InputError
 from presight_core.failpoints import failpoint
 from presight_core.priors.documents import Generation, GenerationTile, TileEntry
 from stages.validation import validate_tile
@@ -84,6 +89,24 @@ def publish(
         "failed": errors,
         "withdrawn": withdrawn,
     }
+
+
+def roll_back(folder: Path, city: str, number: int) -> int:
+    """Publish a generation that shows what an earlier one did; its number.
+
+    Raises InputError if that contains a drive which was removed since, or belongs to the test part, LeaseHeldError
+    while a run builds the city; else what `PriorStore.rollback` raises.
+    """
+    workspace = Workspace.open(folder)  # there may be a store and no catalog: then nothing is known to be removed
+    split = load_city_settings(workspace.city_file(city)).split
+    with hold_city(workspace, city):
+        known, store = choose_drives(workspace.catalog().drive_records(city), split), workspace.store()
+        old = store.generation(city, number)
+        tiles = old.tiles if old else {}
+        barred = sorted({why for tile in tiles.values() if (why := known.why_barred(tile.entry.drives))})
+        if barred:
+            raise InputError(f"{city}: generation {number} may not be shown again: {'; '.join(barred)}; build the city")
+        return store.rollback(city, number)
 
 
 def _withdrawn(plan: CityPlan, old: Generation | None, accepted: set[str]) -> dict[str, str]:

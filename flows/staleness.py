@@ -16,7 +16,8 @@ Kind = Literal[
 ]
 
 FEATURES = "inputs.features."
-SETTINGS_OF_FEATURES = {"masks": "features.masks", "keyframes_only": "training.keyframes_only"}
+MOVING = {"inputs.moving.margin": "features.dynamic_margin", "inputs.moving.shadows": "features.mask_shadows"}
+MOVING["inputs.dynamic_classes"] = "features.dynamic_classes"
 STAGES = {"version": "extraction", "inputs.training.version": "training"}
 STAGES["inputs.training.inputs.features.version"] = "features"
 
@@ -56,9 +57,10 @@ def _reason(path: str, change: str) -> Reason:
         return Reason("model", f"model changed: {path.removeprefix(f'{FEATURES}inputs.')}: {change}")
     if path.startswith(f"{FEATURES}settings."):
         name = path.removeprefix(f"{FEATURES}settings.")
-        return Reason("setting", f"setting {SETTINGS_OF_FEATURES.get(name, name)}: {change}")
-    if path == "inputs.dynamic_classes":
-        return Reason("setting", f"setting features.dynamic_classes: {change}")
+        section = "training" if name == "keyframes_only" else "features"  # both stages heed it; said once
+        return Reason("setting", f"setting {section}.{name}: {change}")
+    if path in MOVING:
+        return Reason("setting", f"setting {MOVING[path]}: {change}")
     if path.startswith("settings."):
         return Reason("setting", f"setting {path.removeprefix('settings.')}: {change}")
     return Reason("other", f"{path}: {change}")

@@ -38,10 +38,18 @@ def extract_features(job: Job) -> dict[str, Any]:
     (drive_id,) = job.drive_ids
     drive = next(drive for drive in workspace.catalog().drives(job.city) if drive.drive_id == drive_id)
     frames = drive_frames(workspace.drives(), drive_id, settings)
-    space = workspace.artifacts().space(job.space_id)
+    space, cache = workspace.artifacts().space(job.space_id), workspace.features()
     extractor = FeatureExtractor.load(settings.features, job.threads)
-    results = extract_drive(drive, frames, space, extractor, settings.features, say)
-    rejects = workspace.features().write(job.features_key, drive_id, frames, results)
+    figures: dict[str, float] = {}
+
+    def note(progress: Progress) -> None:
+        figures.update(progress.figures)
+        say(progress)
+
+    rows = cache.missing_rows(job.features_key, drive_id, len(frames))
+    items = extract_drive(drive, frames, space, extractor, settings.features, rows, note)
+    weights = space.channel_weights if settings.features.cache == "compact" else None
+    rejects = cache.write(job.features_key, drive_id, frames, items, weights, figures)
     return {"images": len(frames), "rejects": [asdict(reject) for reject in rejects]}
 
 
@@ -89,14 +97,14 @@ def extract(job: Job) -> dict[str, Any]:
 def fit_space(job: Job) -> dict[str, Any]:
     """The feature space of the job's drives, frozen: of two fits at once, the first one counts."""
     from flows.plan import drive_frames, space_key
-    from stages import features
+    from stages.features import FeatureExtractor
+    from stages.space_fitting import SpaceImages, fit_space
 
     workspace, settings = job.opened_workspace, job.opened_settings
     drives = [drive for drive in workspace.catalog().drives(job.city) if drive.drive_id in job.drive_ids]
     index = workspace.drives()
-    images = features.space_images((drive, drive_frames(index, drive.drive_id, settings)) for drive in drives)
-    extractor = features.FeatureExtractor.load(settings.features, job.threads)
-    space = features.fit_space(images, extractor, settings.features, say)
+    images = SpaceImages((drive, drive_frames(index, drive.drive_id, settings)) for drive in drives)
+    space = fit_space(images, FeatureExtractor.load(settings.features, job.threads), settings.features, say)
     artifacts = workspace.artifacts()
     return {"space_id": artifacts.pin_space(space_key(settings), artifacts.save_space(space))}
 
@@ -111,7 +119,7 @@ def _training(job: Job) -> tuple[Any, PixelSource]:
     frames = frames.select(_readable(job, frames))
     roots = {drive.drive_id: drive.root for drive in workspace.catalog().drives(job.city)}
     cache = workspace.features()
-    source = CachedPixels(frames, roots, cache, job.features_key, settings.training.image_scale)
+    source = CachedPixels(frames, roots, cache, job.features_key, settings)
     channels = workspace.artifacts().space(job.space_id).channel_count
     fields = sub_fields(frames.positions, settings.tiling)
     return TileTraining(job.tile_id, frames, fields, settings, channels, job.threads, job.device), source

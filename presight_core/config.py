@@ -36,8 +36,13 @@ class FeatureSettings(Settings):
     segmentation_model: str = "tiny"  # name of a shipped model, or path of a model card
     feature_model: str = "tiny"  # likewise
     channels: Count = 64  # of the shared feature space; a model with fewer channels gives fewer
-    sample_patches: Count = 200_000  # patches that the feature space is fitted on
+    sample_patches: Count = 200_000  # patches that give each channel of the feature space its range
+    space: str | None = None  # id of a fitted space; None: the first one that was fitted for these models
+    cache: Literal["exact", "compact"] = "compact"  # compact: 60 kB an image; no field can tell (decision 010)
+    parked_cars: Literal["drop", "keep"] = "drop"  # keep: vehicles that stand still between two frames are mapped
     dynamic_classes: tuple[str, ...] = classes.DYNAMIC
+    dynamic_margin: Share = 0.005  # of the image's height, around what can move: labels are rough at edges
+    mask_shadows: bool = False  # mask dark ground next to what can move, too
 
 
 class TilingSettings(Settings):

@@ -38,6 +38,21 @@ class FeatureSpace:
                 digest.update(np.ascontiguousarray(getattr(self, field.name), np.float32).tobytes())
         return digest.hexdigest()[:DIGEST_LENGTH]
 
+    @property
+    def channel_weights(self) -> tuple[float, ...]:
+        """How fine the compact cache keeps each channel (C,)."""
+        from presight_core.feature_codec import channel_weights  # numba takes a second
+
+        return tuple(channel_weights(self.high - self.low).tolist())
+
+    def picture(self, features: ArrayLike) -> NDArray[np.uint8]:
+        """The map from features (..., C) to RGB (..., 3) of every picture: the three directions of largest variance.
+
+        Each has its 1..99 % range spread over 0..255, so that equal features have equal colours everywhere. The last
+        channel repeats where C < 3.
+        """
+        return np.asarray(features, np.uint8)[..., np.minimum([0, 1, 2], self.channel_count - 1)]
+
     def encode(self, raw: ArrayLike) -> NDArray[np.uint8]:
         """Features (..., C) as uint8, 255 = 1.0, of raw model output (..., D); clipped to the space's range."""
         projected = (np.asarray(raw, np.float32) - self.mean) @ self.components.T

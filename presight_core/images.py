@@ -10,6 +10,7 @@ from presight_core import classes
 from presight_core.drives import Reject
 from presight_core.errors import InputError
 
+JPEG_START = b"\xff\xd8"
 MASKS_FOLDER = "segmentation"  # of a data set: precomputed label maps, beside `samples` and `sweeps`
 
 
@@ -25,23 +26,36 @@ class ImageError(InputError):
         return Reject(self.code, self.file, self.detail, self.cure, drive)
 
 
-def read_rgb(file: Path, width_px: int, height_px: int) -> NDArray[np.uint8]:
+def read_rgb(file: Path, width_px: int, height_px: int, least_px: tuple[int, int] = (0, 0)) -> NDArray[np.uint8]:
     """A camera image (H, W, 3), which must have the given size; an EXIF rotation is ignored.
 
-    Intrinsics describe the sensor's rows and columns, which a rotation for viewing would swap.
-    Raises ImageError if the file is missing, broken or of another size.
+    With `least_px` (width, height) a JPEG is decoded at a half, a quarter or an eighth of its size if that is not
+    smaller: libjpeg-turbo then leaves out most of the work. Intrinsics describe the sensor's rows and columns, which a
+    rotation for viewing would swap. Raises ImageError if the file is missing, broken or of another size.
     """
     import cv2
 
     content = _content(file, "image", "restore the file or ingest the drive again")
-    bgr = _decoded(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    shrink = _shrink(content, (width_px, height_px), least_px)
+    colour = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
+    bgr = _decoded(content, colour.get(shrink, cv2.IMREAD_REDUCED_COLOR_8) | cv2.IMREAD_IGNORE_ORIENTATION)
     if bgr is None:
         cure = "copy the image again from its source"
         raise ImageError("image-broken", str(file), f"{len(content)} bytes that do not decode as an image", cure)
-    if bgr.shape[:2] != (height_px, width_px):
-        detail = f"the image is {bgr.shape[1]} x {bgr.shape[0]} px, its table says {width_px} x {height_px}"
+    if bgr.shape[:2] != (-(-height_px // shrink), -(-width_px // shrink)):
+        width, height = bgr.shape[1] * shrink, bgr.shape[0] * shrink
+        about = "" if shrink == 1 else "about "
+        detail = f"the image is {about}{width} x {height} px, its table says {width_px} x {height_px}"
         raise ImageError("image-size", str(file), detail, "ingest the data set that the image belongs to")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def _shrink(content: NDArray[np.uint8], size_px: tuple[int, int], least_px: tuple[int, int]) -> int:
+    """By how much a JPEG may shrink while it is decoded: 1, 2, 4 or 8."""
+    if content[:2].tobytes() != JPEG_START or min(least_px) <= 0:
+        return 1
+    room = min(size // least for size, least in zip(size_px, least_px, strict=True))
+    return next(shrink for shrink in (8, 4, 2, 1) if shrink <= max(room, 1))
 
 
 def read_labels(file: Path) -> NDArray[np.uint8]:

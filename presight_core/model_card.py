@@ -18,6 +18,8 @@ from presight_core.errors import InputError, SettingsError
 Kind = Literal["segmentation", "features"]
 Channels = tuple[float, float, float]  # red, green, blue
 
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
 MODELS_FOLDER = Path(str(resources.files("presight_core"))) / "models"
 
 
@@ -27,10 +29,12 @@ class ModelCard(Settings):
     name: str
     kind: Kind
     file: Path  # in the TOML a plain name, beside the card; here its full path
-    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    sha256: Sha256
+    external_data: dict[str, Sha256] = Field(default_factory=dict)  # more files of weights beside it
     input: str  # name of the (N, 3, H, W) float32 input
     input_height_px: Count  # images are resized to this size
     input_width_px: Count
+    resample: Literal["area", "bilinear", "bicubic"] = "area"  # by OpenCV's averages, or as Pillow and transformers do
     mean: Channels  # of RGB scaled to 0..1
     std: Channels
     output: str
@@ -65,7 +69,8 @@ class ModelCard(Settings):
         """
         path = _card_path(name_or_path, kind)
         values = read_toml(path)
-        _refuse_other_folders(values.get("file"), path)
+        for file in (values.get("file"), *dict(values.get("external_data") or {})):
+            _refuse_other_folders(file, path)
         card = validate(ModelCard, {**values, "file": path.parent / str(values.get("file", ""))}, str(path))
         if card.kind != kind:
             raise SettingsError(f"{path}: kind: this is a {card.kind} model; name a card of kind {kind}")
@@ -73,15 +78,20 @@ class ModelCard(Settings):
         return card
 
     def read_model(self) -> bytes:
-        """The ONNX file's bytes. Raises InputError if it is absent or its SHA-256 is not the card's."""
+        """The ONNX file's bytes. Raises InputError if a file is absent or its SHA-256 is not the card's."""
+        for name, digest in self.external_data.items():
+            self._read(self.file.parent / name, digest)
+        return self._read(self.file, self.sha256)
+
+    def _read(self, file: Path, digest: str) -> bytes:
         try:
-            content = self.file.read_bytes()
+            content = file.read_bytes()
         except OSError as error:
-            raise InputError(f"{self.file}: {error.strerror}; put the model of card {self.name} there") from error
+            raise InputError(f"{file}: {error.strerror}; put the model of card {self.name} there") from error
         found = hashlib.sha256(content).hexdigest()
-        if found != self.sha256:
+        if found != digest:
             raise InputError(
-                f"{self.file}: SHA-256 is {found}, the card says {self.sha256}; "
+                f"{file}: SHA-256 is {found}, the card says {digest}; "
                 "restore the file, or correct the card if the new model is meant"
             )
         return content

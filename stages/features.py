@@ -1,94 +1,82 @@
 """The feature stage: camera images become label maps and features of the shared feature space."""
 
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass
-from operator import length_hint
 from pathlib import Path
 from time import perf_counter
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from presight_core import classes
 from presight_core.config import FeatureSettings
 from presight_core.drives import Drive, FrameTable, Reject
 from presight_core.errors import InputError
 from presight_core.feature_space import FeatureSpace
 from presight_core.images import ImageError, mask_path, read_labels, read_rgb
-from presight_core.model_card import ModelCard
 from presight_core.pixels import FrameLayers
 from presight_core.progress import Progress, Report, silent
 from stages.networks import FeatureExtractor
+from stages.pipeline import Pipeline, Step
+from stages.standing import Shot, standing_vehicles
 
-__all__ = ["FeatureExtractor", "extract_drive", "fit_space", "space_images"]
+__all__ = ["FeatureExtractor", "Item", "extract_drive", "read_image"]
 
-CAMERAS_PER_DRIVE = 3  # the released code fits the space on the first frame of three cameras of every scene
-RANGE_PERCENTILES = (1, 99)  # of each channel: rare patches must not squeeze all others into a few of 256 steps
-DEAD_RANGE = 1e-6  # of the widest channel: a narrower one is rounding noise, and stays near zero
-CHUNK_PATCHES = 1 << 14  # patches in float64 at a time: 100 MB for 768 channels
-
-
-def space_images(drives: Iterable[tuple[Drive, FrameTable]]) -> Iterator[NDArray[np.uint8]]:
-    """The images that the feature space is fitted on: the first keyframe of up to three cameras of every drive.
-
-    Drives go in the order of their ids. An image that cannot be read is passed over.
-    """
-    for drive, frames in sorted(drives, key=lambda pair: pair[0].drive_id):
-        for row in _space_rows(frames):
-            try:
-                yield _read_image(drive, frames, row)
-            except ImageError:
-                continue
+Item: TypeAlias = tuple[int, FrameLayers | Reject]  # a row, and its layers or why there are none
 
 
-def fit_space(
-    images: Iterable[NDArray[np.uint8]],
-    extractor: FeatureExtractor,
-    settings: FeatureSettings,
-    report: Report = silent,
-) -> FeatureSpace:
-    """The feature space of RGB images: principal directions, each scaled by its 1..99 % range to [0, 1].
-
-    Fitted on a thinned sample of at most `settings.sample_patches` patches; the same images give the same space.
-    It has `settings.channels` channels, or as many as the model. Raises InputError without images.
-    """
-    sample = _PatchSample(settings.sample_patches)
-    total = length_hint(images)
-    for done, image in enumerate(images, 1):
-        sample.add(extractor.raw_features([image])[0])
-        report(Progress("feature space", done, max(total, done)))
-    if len(sample.patches) == 0:
-        raise InputError("no image to fit the feature space on; check that the drives' images can be read")
-    return _space_of(sample.patches, settings.channels, extractor.feature_card)
-
-
-def extract_drive(
+def extract_drive(  # noqa: PLR0913, PLR0917 - the last two have defaults
     drive: Drive,
     frames: FrameTable,
     space: FeatureSpace,
     extractor: FeatureExtractor,
     settings: FeatureSettings,
+    rows: NDArray[np.int64] | None = None,
     report: Report = silent,
-) -> Iterator[tuple[int, FrameLayers] | Reject]:
-    """Label maps and features of a drive's frames: one item a row, in order; a Reject where the image is unusable.
+) -> Iterator[Item]:
+    """Label maps and features of a drive's frames, or of some `rows` of them, in order; a Reject where one is unusable.
 
-    Label maps come from `segmentation/` of the data set or from the model, as `settings.masks` says. Raises
-    InputError if the space belongs to another model.
+    Label maps come from `segmentation/` of the data set or from the model, as `settings.masks` says. The report's
+    figures are images a second and the share of time that each step is busy, of which `store` is the caller's own
+    work between two items. Raises InputError if the space belongs to another model.
     """
     if space.model_sha256 != extractor.feature_card.sha256:
         raise InputError(
             f"feature space {space.space_id} was fitted on model {space.model_sha256[:12]}, "
             f"the feature model is {extractor.feature_card.sha256[:12]}; use that model, or fit a new space"
         )
-    return _Extraction(drive, frames, space, extractor, settings.masks).run(report)
+    rows = np.arange(len(frames)) if rows is None else rows
+    return _Extraction(drive, frames, space, extractor, settings).run(rows, report)
+
+
+def read_image(drive: Drive, frames: FrameTable, row: int, least_px: tuple[int, int] = (0, 0)) -> NDArray[np.uint8]:
+    """The image of a row, shrunk while decoding if it stays at least as large as `least_px` (width, height).
+
+    Raises ImageError.
+    """
+    file = Path(drive.root) / str(frames.path[row])
+    return read_rgb(file, int(frames.width_px[row]), int(frames.height_px[row]), least_px)
 
 
 @dataclass(frozen=True)
 class _Loaded:
     """One frame as read from the data set; labels are None where the model shall make them."""
 
+    row: int
     rgb: NDArray[np.uint8]
     labels: NDArray[np.uint8] | None
+    neighbour: Shot | None  # the image before or after it, where standing vehicles are wanted
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Some frames on their way: the readable ones, the refused ones, and what the networks take and give."""
+
+    loaded: list[_Loaded]
+    refused: list[tuple[int, Reject]]
+    feature_values: NDArray[np.float32]  # input, then output
+    label_values: NDArray | None  # likewise; None where no frame needs the model
 
 
 @dataclass(frozen=True)
@@ -99,123 +87,87 @@ class _Extraction:
     frames: FrameTable
     space: FeatureSpace
     extractor: FeatureExtractor
-    masks: str
+    settings: FeatureSettings
 
-    def run(self, report: Report) -> Iterator[tuple[int, FrameLayers] | Reject]:
-        started = perf_counter()
-        total = len(self.frames)
-        done = 0
-        for loaded in _ahead(self._load, total, self.extractor.batch_size, self.extractor.threads):
-            for row, item in enumerate(self._layers(loaded), done):
-                yield item if isinstance(item, Reject) else (row, item)
-            done += len(loaded)
-            report(Progress("features", done, total, {"images/s": done / (perf_counter() - started)}))
+    def run(self, rows: NDArray[np.int64], report: Report) -> Iterator[Item]:
+        size = self.extractor.batch_size
+        pipeline = Pipeline(
+            [
+                Step("read", self._read, self.extractor.threads),
+                Step("prepare", self._prepare),
+                Step("networks", self._infer),
+                Step("project", self._project),
+            ]
+        )
+        done, stored, started = 0, 0.0, perf_counter()
+        for items in pipeline.run(rows[start : start + size] for start in range(0, len(rows), size)):
+            before = perf_counter()
+            yield from items
+            stored += perf_counter() - before
+            done += len(items)
+            seconds = perf_counter() - started
+            shares = {**pipeline.shares(), "store": stored / seconds}
+            report(Progress("features", done, len(rows), {"images/s": done / seconds, **shares}))
 
-    def _load(self, row: int) -> _Loaded | Reject:
+    def _read(self, rows: NDArray[np.int64]) -> list[_Loaded | tuple[int, Reject]]:
+        return [self._load(int(row)) for row in rows]
+
+    def _load(self, row: int) -> _Loaded | tuple[int, Reject]:
         try:
-            return _Loaded(_read_image(self.drive, self.frames, row), self._precomputed_labels(row))
+            rgb = read_image(self.drive, self.frames, row, self.extractor.least_px)
+            return _Loaded(row, rgb, self._precomputed_labels(row), self._neighbour(row))
         except ImageError as error:
-            return error.reject(self.drive.name)
+            return row, error.reject(self.drive.name)
 
     def _precomputed_labels(self, row: int) -> NDArray[np.uint8] | None:
-        if self.masks == "model":
+        if self.settings.masks == "model":
             return None
         file = Path(self.drive.root) / mask_path(str(self.frames.path[row]))
-        if self.masks == "auto" and not file.is_file():
+        if self.settings.masks == "auto" and not file.is_file():
             return None
         return read_labels(file)
 
-    def _layers(self, loaded: list[_Loaded | Reject]) -> list[FrameLayers | Reject]:
-        """Layers of one batch, in its order."""
-        images = [item.rgb for item in loaded if isinstance(item, _Loaded)]
-        unlabelled = [item.rgb for item in loaded if isinstance(item, _Loaded) and item.labels is None]
-        features = iter(self.space.encode(self.extractor.raw_features(images)) if images else ())
-        labels = iter(self.extractor.labels(unlabelled) if unlabelled else ())
-        return [
-            item
-            if isinstance(item, Reject)
-            else FrameLayers(next(labels) if item.labels is None else item.labels, next(features))
-            for item in loaded
+    def _neighbour(self, row: int) -> Shot | None:
+        """The frame before this one of its camera, or else the one after it, or else nothing."""
+        if self.settings.parked_cars == "drop":
+            return None
+        for other in (row - 1, row + 1):
+            if 0 <= other < len(self.frames) and self.frames.camera[other] == self.frames.camera[row]:
+                try:
+                    return self._shot(other, read_image(self.drive, self.frames, other, self.extractor.least_px))
+                except ImageError:
+                    continue
+        return None
+
+    def _shot(self, row: int, rgb: NDArray[np.uint8]) -> Shot:
+        return Shot(rgb, self.frames.camera_of(row).scaled(rgb.shape[1], rgb.shape[0]))
+
+    def _prepare(self, items: list[_Loaded | tuple[int, Reject]]) -> _Batch:
+        loaded = [item for item in items if isinstance(item, _Loaded)]
+        unlabelled = [item.rgb for item in loaded if item.labels is None]
+        return _Batch(
+            loaded,
+            [item for item in items if not isinstance(item, _Loaded)],
+            self.extractor.features.prepare([item.rgb for item in loaded]),
+            self.extractor.segmentation.prepare(unlabelled) if unlabelled else None,
+        )
+
+    def _infer(self, batch: _Batch) -> _Batch:
+        labels = None if batch.label_values is None else self.extractor.segmentation.infer(batch.label_values)
+        return _Batch(batch.loaded, batch.refused, self.extractor.features.infer(batch.feature_values), labels)
+
+    def _project(self, batch: _Batch) -> list[Item]:
+        labels = iter(() if batch.label_values is None else batch.label_values.argmax(-1).astype(np.uint8))
+        features = self.space.encode(batch.feature_values)
+        done: list[Item] = [
+            (item.row, FrameLayers(self._kept(item, next(labels) if item.labels is None else item.labels), values))
+            for item, values in zip(batch.loaded, features, strict=True)
         ]
+        return sorted([*done, *batch.refused], key=lambda item: item[0])
 
-
-def _ahead(
-    load: Callable[[int], _Loaded | Reject], total: int, batch_size: int, threads: int
-) -> Iterator[list[_Loaded | Reject]]:
-    """Rows 0..total-1 in batches; the next batch is read while the caller works on this one."""
-    with ThreadPoolExecutor(threads) as pool:
-        waiting: list[list[Future]] = []
-        for start in range(0, total, batch_size):
-            waiting.append([pool.submit(load, row) for row in range(start, min(start + batch_size, total))])
-            if len(waiting) > 1:
-                yield [future.result() for future in waiting.pop(0)]
-        for batch in waiting:
-            yield [future.result() for future in batch]
-
-
-def _read_image(drive: Drive, frames: FrameTable, row: int) -> NDArray[np.uint8]:
-    file = Path(drive.root) / str(frames.path[row])
-    return read_rgb(file, int(frames.width_px[row]), int(frames.height_px[row]))
-
-
-def _space_rows(frames: FrameTable) -> list[int]:
-    """First keyframe (or frame, where there is none) of up to three cameras, spread over the cameras' names."""
-    cameras = np.unique(frames.camera)
-    spread = cameras[:: -(-len(cameras) // CAMERAS_PER_DRIVE)]
-    order = np.lexsort((frames.timestamp_us, ~frames.is_keyframe))
-    return [int(order[np.argmax(frames.camera[order] == camera)]) for camera in spread]
-
-
-class _PatchSample:
-    """An even sample of at most `limit` patches of a stream of images: every 2^n-th patch, n growing as needed."""
-
-    def __init__(self, limit: int):
-        self.patches = np.zeros((0, 0), np.float32)
-        self._limit, self._stride, self._seen, self._images = limit, 1, 0, 0
-
-    def add(self, features: NDArray[np.float32]) -> None:
-        """Take part of the patches (rows, columns, D) of the next image."""
-        # Shuffled, because a stride of 2^n would fall on the same few columns in every row.
-        patches = np.random.default_rng(self._images).permutation(features.reshape(-1, features.shape[-1]))
-        taken = patches[-self._seen % self._stride :: self._stride]
-        self.patches = np.concatenate([self.patches, taken]) if self._images else taken
-        self._seen += len(patches)
-        self._images += 1
-        while len(self.patches) > self._limit:
-            self.patches = self.patches[::2]
-            self._stride *= 2
-
-
-def _space_of(patches: NDArray[np.float32], channels: int, card: ModelCard) -> FeatureSpace:
-    mean = patches.mean(0, dtype=np.float64)
-    variances, directions = _principal_directions(patches, mean)
-    components = directions[:channels].astype(np.float32)
-    projected = (patches - mean.astype(np.float32)) @ components.T
-    low, high = np.percentile(projected, RANGE_PERCENTILES, axis=0)
-    dead = high - low <= DEAD_RANGE * (high - low).max()
-    explained = variances[:channels] / max(variances.sum(), np.finfo(np.float64).tiny)
-    return FeatureSpace(
-        mean=mean.astype(np.float32),
-        components=components,
-        low=low.astype(np.float32),
-        high=np.where(dead, low + 1, high).astype(np.float32),
-        explained=explained.astype(np.float32),
-        model_sha256=card.sha256,
-    )
-
-
-def _principal_directions(
-    patches: NDArray[np.float32], mean: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Variances (D,), largest first, and unit directions (D, D), a row each.
-
-    A direction's sign is free; here its largest entry is positive, so that equal data give equal spaces.
-    """
-    covariance = np.zeros((len(mean), len(mean)))
-    for start in range(0, len(patches), CHUNK_PATCHES):
-        centred = patches[start : start + CHUNK_PATCHES] - mean
-        covariance += centred.T @ centred
-    variances, vectors = np.linalg.eigh(covariance / len(patches))
-    directions = vectors[:, ::-1].T
-    largest = directions[np.arange(len(directions)), np.abs(directions).argmax(-1)]
-    return np.maximum(variances[::-1], 0), directions * np.where(largest < 0, -1, 1)[:, None]
+    def _kept(self, item: _Loaded, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The labels, with vehicles that stand still unknown: like all that is not masked, they are then mapped."""
+        if item.neighbour is None:
+            return labels
+        standing = standing_vehicles(labels, self._shot(item.row, item.rgb), item.neighbour)
+        return np.where(standing, np.uint8(classes.UNKNOWN), labels)

@@ -13,6 +13,9 @@ from presight_core.images import resized
 from presight_core.model_card import ModelCard
 
 BATCH_PIXELS = 1 << 20  # input pixels a batch: 11 images of the tiny models, one of DINO; activations stay small
+STANDARD_DOMAINS = ("", "ai.onnx")
+REFUSED_OPERATORS = {"Loop", "Scan", "RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike"}
+REFUSED_OPERATORS |= {"Bernoulli", "Multinomial"}
 ERRORS_ONLY = 3  # ONNX Runtime's log level; its warnings are about graph optimisation
 
 
@@ -22,12 +25,12 @@ class Network:
     def __init__(self, card: ModelCard, threads: int = 1):
         """Verify the model of `card` and open it on the GPU where ONNX Runtime has one, else on `threads` cores.
 
-        Raises InputError if the file is not the card's, keeps data in other files, or takes or gives other
-        arrays than the card says.
+        Raises InputError if the file is not the card's, keeps data in files that the card does not list, uses
+        operators that it may not, or takes or gives other arrays than the card says.
         """
         self.card = card
         content = card.read_model()
-        refuse_external_data(content, card)
+        refuse_what_no_hash_covers(content, card)
         self._session = _session(content, card, threads)
         _check_shape(card, "input", card.input, self._session.get_inputs(), (1, 3, *_input_size(card)))
         _check_shape(card, "output", card.output, self._session.get_outputs(), (1, *_output_shape(card)))
@@ -37,19 +40,29 @@ class Network:
 
     def run(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """The network's output (N, rows, columns, channels) for RGB images of any size."""
-        parts = [self._run_batch(images[i : i + self.batch_size]) for i in range(0, len(images), self.batch_size)]
-        return np.concatenate(parts)
+        return self.infer(self.prepare(images))
 
-    def _run_batch(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        output: Any = self._session.run([self.card.output], {self.card.input: prepare(images, self.card)})[0]
-        expected = (len(images), *_output_shape(self.card))
+    def prepare(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+        """The network's input (N, 3, H, W) for RGB images of any size."""
+        return prepare(images, self.card)
+
+    def infer(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The network's output (N, rows, columns, channels) for its input."""
+        parts = [self._infer_batch(values[i : i + self.batch_size]) for i in range(0, len(values), self.batch_size)]
+        return np.concatenate(
+            [np.zeros((0, self.card.rows, self.card.columns, self.card.channels), np.float32), *parts]
+        )
+
+    def _infer_batch(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        output: Any = self._session.run([self.card.output], {self.card.input: values})[0]
+        expected = (len(values), *_output_shape(self.card))
         if output.shape != expected:
             raise InputError(f"{self.card.file}: output {output.shape}, the card says {expected}; correct the card")
         if not np.isfinite(output).all():
             raise InputError(f"{self.card.file}: the output holds NaN or infinity; export the model in float32")
         if self.card.layout == "NCHW":
             return output.transpose(0, 2, 3, 1)
-        return output.reshape(len(images), self.card.rows, self.card.columns, self.card.channels)
+        return output.reshape(len(values), self.card.rows, self.card.columns, self.card.channels)
 
 
 class FeatureExtractor:
@@ -68,25 +81,35 @@ class FeatureExtractor:
 
     def labels(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """Label maps (N, rows, columns) of Cityscapes train ids, at the network's output resolution."""
-        return self._segmentation.run(images).argmax(-1).astype(np.uint8)
+        return self.segmentation.run(images).argmax(-1).astype(np.uint8)
 
     def raw_features(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """Features (N, rows, columns, D) as the network gives them, not yet in the shared feature space."""
-        return self._features.run(images)
+        return self.features.run(images)
 
     @property
     def batch_size(self) -> int:
         """How many images make a good batch."""
-        return self._features.batch_size
+        return self.features.batch_size
+
+    @property
+    def least_px(self) -> tuple[int, int]:
+        """Width and height that an image should keep when it is decoded; (0, 0) where every pixel counts."""
+        cards = [card for card in (self.segmentation_card, self.feature_card) if card is not None]
+        if any(card.resample != "area" for card in cards):
+            return 0, 0
+        return max(card.input_width_px for card in cards), max(card.input_height_px for card in cards)
 
     @cached_property
-    def _segmentation(self) -> Network:
+    def segmentation(self) -> Network:
+        """The segmentation network. Raises InputError if there is none."""
         if self.segmentation_card is None:
             raise InputError("there is no segmentation model; set features.masks to auto or model")
         return Network(self.segmentation_card, self.threads)
 
     @cached_property
-    def _features(self) -> Network:
+    def features(self) -> Network:
+        """The feature network."""
         return Network(self.feature_card, self.threads)
 
 
@@ -97,12 +120,27 @@ def prepare(images: Sequence[NDArray[np.uint8]], card: ModelCard) -> NDArray[np.
     scale = (1 / (255 * np.array(card.std))).astype(np.float32)
     shift = (np.array(card.mean) / np.array(card.std)).astype(np.float32)
     for image, place in zip(images, batch, strict=True):
-        place[:] = (resized(image, width, height) * scale - shift).transpose(2, 0, 1)
+        place[:] = (_resized(image, card) * scale - shift).transpose(2, 0, 1)
     return batch
 
 
-def refuse_external_data(content: bytes, card: ModelCard) -> None:
-    """Raise InputError if an ONNX model is unreadable, or would read weights from other files: no hash covers those."""
+def _resized(image: NDArray[np.uint8], card: ModelCard) -> NDArray[np.uint8]:
+    """The image at the network's input size, by the method that the network was trained with."""
+    height, width = _input_size(card)
+    if card.resample == "area":
+        return resized(image, width, height)
+    from PIL import Image
+
+    method = Image.Resampling[card.resample.upper()]  # as transformers does it: with a filter as wide as it shrinks
+    return np.asarray(Image.fromarray(image).resize((width, height), method))
+
+
+def refuse_what_no_hash_covers(content: bytes, card: ModelCard) -> None:
+    """Raise InputError if an ONNX model is unreadable, or if more than the card's files would decide its output.
+
+    Such are weights in files that the card does not list, operators of other domains (code of their own), loops (no
+    bound on time) and random numbers (the cache holds what a recipe gives, once and for all).
+    """
     import onnx
     from google.protobuf.message import DecodeError
 
@@ -110,25 +148,30 @@ def refuse_external_data(content: bytes, card: ModelCard) -> None:
         model = onnx.load_model_from_string(content)
     except DecodeError as error:
         raise InputError(f"{card.file}: not an ONNX model ({error}); export it again") from error
-    for tensor in _tensors(model):
-        if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
+    for tensor in _messages(model, "TensorProto"):
+        external = {entry.key: entry.value for entry in tensor.external_data}
+        is_external = tensor.data_location == onnx.TensorProto.EXTERNAL or external
+        if is_external and external.get("location") not in card.external_data:
             raise InputError(
-                f"{card.file}: tensor {tensor.name!r} is kept in another file; save the model as one file "
-                "(onnx.save(..., save_as_external_data=False))"
+                f"{card.file}: tensor {tensor.name!r} is kept in another file, which the card's external_data does not "
+                "list; save the model as one file (onnx.save(..., save_as_external_data=False))"
             )
+    for node in _messages(model, "NodeProto"):
+        if node.domain not in STANDARD_DOMAINS or node.op_type in REFUSED_OPERATORS:
+            name = f"{node.domain}.{node.op_type}".removeprefix(".")
+            raise InputError(f"{card.file}: operator {name} is refused; export the model with standard operators")
 
 
-def _tensors(message: Any) -> Iterator[Any]:
-    """Every TensorProto inside a protobuf message: weights, constants, sub-graphs, functions."""
+def _messages(message: Any, name: str) -> Iterator[Any]:
+    """Every message of a name inside a protobuf message: in sub-graphs, constants and functions, too."""
     from google.protobuf.message import Message
 
-    if message.DESCRIPTOR.name == "TensorProto":
+    if message.DESCRIPTOR.name == name:
         yield message
-        return
     for field, value in message.ListFields():
         if field.message_type is not None:
             for child in [value] if isinstance(value, Message) else value:
-                yield from _tensors(child)
+                yield from _messages(child, name)
 
 
 def _session(content: bytes, card: ModelCard, threads: int) -> Any:
@@ -142,7 +185,8 @@ def _session(content: bytes, card: ModelCard, threads: int) -> Any:
     wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
     providers = [provider for provider in wanted if provider in onnxruntime.get_available_providers()]
     try:
-        return onnxruntime.InferenceSession(content, options, providers=providers)
+        model = str(card.file) if card.external_data else content  # other files are found beside a path only
+        return onnxruntime.InferenceSession(model, options, providers=providers)
     except Exception as error:  # ONNX Runtime's errors have no common base but this
         raise InputError(f"{card.file}: ONNX Runtime refuses the model ({error}); export it again") from error
 

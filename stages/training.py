@@ -2,6 +2,8 @@
 
 import hashlib
 import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,19 +18,23 @@ from presight_core.config import CitySettings, TrainingSettings
 from presight_core.drives import FrameTable
 from presight_core.errors import BuildError, InputError, NotFoundError
 from presight_core.field import checkpoint, losses, schedule, threads
-from presight_core.field.tile_field import FieldShape, Rays, Rendering, Sampling, TileField
+from presight_core.field.rays import Rays
+from presight_core.field.tile_field import FieldShape, Rendering, Sampling, TileField
 from presight_core.pixels import PixelSource
 from presight_core.progress import Progress, Report, silent
 from presight_core.recipes import Recipe
 from presight_core.tiles import SubField
 from stages import versions
-from stages.ground import Ground, Stretches
-from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
+from stages.card_pool import Targets
+from stages.feeding import Feed
+from stages.ground import Ground
+from stages.ray_pool import PixelBatch
 
 REPORT_SECONDS = 0.5
-POOL_BYTES = 3 << 30  # of decoded images in memory
-POOL_STEPS = 250  # a pool that cannot hold all images is drawn anew this often (released code: about 280)
 PULSE_WIDTHS = (0.03, 0.003)  # of the blurred interlevel loss, coarse proposal first (released code)
+
+
+Advance = Callable[[int], tuple[dict[str, Tensor], float]]  # does a step; its losses, and seconds waited so far
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,10 @@ class TileTraining:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Where the field lies (see `load_field`), and loss, psnr_db and rays_per_s of the end of training."""
+    """Where the field lies (see `load_field`), and figures of the end of training.
+
+    loss, psnr_db, rays_per_s, and waiting_share: of the time, how much was spent waiting for batches.
+    """
 
     folder: Path
     metrics: dict[str, float]
@@ -75,29 +84,40 @@ def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Re
     uninterrupted one would. Raises InputError if there is nothing to train on or an image cannot be
     read, BuildError if the loss stops being a number.
     """
+    from stages import card_training
+
     threads.use_threads(job.threads)
     threads.keep_freed_memory()
     rows = training_rows(job.frames, job.settings.training)
     if not len(rows):
         raise InputError(f"tile {job.tile_id}: none of its {len(job.frames)} frames is for training; ingest more")
-    run = Run(job, scratch)
+    run = card_training.CardRun(job, scratch, source, rows) if card_training.suits(job) else Run(job, scratch)
     if run.step < job.settings.training.steps:
         report(Progress("training", run.step, job.settings.training.steps))
-        pools = _Pools(job, source, rows)
-        with _Log(job, scratch, report) as log:
-            _train(job, run, pools, log)
+        with _steps(job, run, source, rows) as advance, _Log(job, scratch, report) as log:
+            _train(job, run, advance, log)
     checkpoint.save_field(scratch / "field", run.field)
     return TrainingResult(scratch / "field", run.metrics)
 
 
-def _train(job: TileTraining, run: "Run", pools: "_Pools", log: "_Log") -> None:
+@contextmanager
+def _steps(job: TileTraining, run: "Run", source: PixelSource, rows: NDArray[np.int64]) -> Iterator[Advance]:
+    """What takes a run one step further: a card draws its own rays, else a feed gives them."""
+    from stages.card_training import CardRun
+
+    if isinstance(run, CardRun):
+        with closing(run):
+            yield lambda step: (run.advance(step), 0.0)
+    else:
+        with Feed(job, source, rows) as feed:
+            yield lambda step: (run.train(step, feed.batch(step)), feed.waited_s)
+
+
+def _train(job: TileTraining, run: "Run", advance: Advance, log: "_Log") -> None:
     """All steps that are left."""
-    settings, dynamic = job.settings.training, job.settings.features.dynamic_classes
+    settings = job.settings.training
     for step in range(run.step, settings.steps):
-        pool, groups = pools.at(step)
-        random = np.random.default_rng([settings.seed, step])
-        batch = draw_static(pool, settings.batch_rays, groups, random, dynamic, settings.thin_weight)
-        log.add(step, run.train(step, batch))
+        log.add(step, *advance(step))
         if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
             log.flush(step)
             run.save(step + 1, log.figures)
@@ -153,41 +173,6 @@ def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.i
     return rows, holdout_mask(frames.select(rows), settings.holdout_every)
 
 
-class _Pools:
-    """The pool of each step: all images if they fit into memory, else a random part that changes now and then."""
-
-    def __init__(self, job: TileTraining, source: PixelSource, rows: NDArray[np.int64]) -> None:
-        self._job, self._source, self._rows = job, source, rows
-        centroids = np.array([sub_field.centroid_m for sub_field in job.sub_fields])
-        offsets = job.frames.positions[rows][:, None] - centroids[None]
-        self._sub_field = np.linalg.norm(offsets, axis=-1).argmin(-1)
-        self._capacity = max(1, POOL_BYTES // bytes_of(source.load(int(rows[0]))))
-        self._epoch = -1
-
-    def at(self, step: int) -> tuple[RayPool, list[NDArray[np.int64]]]:
-        """The pool of a step, and its images grouped by sub-field."""
-        epoch = 0 if len(self._rows) <= self._capacity else step // POOL_STEPS
-        if epoch != self._epoch:
-            self._epoch = epoch
-            chosen = self._choose(epoch)
-            self._pool = RayPool(self._job.frames, self._source, self._rows[chosen], self._job.threads)
-            owner = self._sub_field[chosen]
-            self._groups = [np.flatnonzero(owner == sub_field) for sub_field in np.unique(owner)]
-        return self._pool, self._groups
-
-    def _choose(self, epoch: int) -> NDArray[np.int64]:
-        """Places in `rows` of the pool's images, as many of each sub-field as there is room for."""
-        if len(self._rows) <= self._capacity:
-            return np.arange(len(self._rows))
-        random = np.random.default_rng([self._job.settings.training.seed, epoch, 1])  # 1: apart from the steps'
-        order = random.permutation(len(self._rows))
-        rank = np.empty(len(order), np.int64)  # how many of its sub-field come before each
-        for sub_field in np.unique(self._sub_field):
-            places = np.flatnonzero(self._sub_field[order] == sub_field)
-            rank[places] = np.arange(len(places))
-        return np.sort(order[np.argsort(rank, kind="stable")[: self._capacity]])
-
-
 class Run:
     """A field in training: its parameters, its optimiser, and their checkpoint."""
 
@@ -213,18 +198,49 @@ class Run:
         """One step of the optimiser; its losses by name."""
         for group in self._optimiser.param_groups:
             group["lr"] = schedule.learning_rate(step, self._settings)
+        jitter = self._random(step, len(batch.rows), self.passes)
+        exponent, trains_proposals = self._schedule(step)
+        targets = Targets(
+            *(torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.labels, batch.features))
+        )
+        sampling = Sampling(jitter, exponent, trains_proposals)
+        if self._ground is None:
+            return self._descend(self._rays(batch), targets, sampling)
+        start_m, end_m = (torch.from_numpy(value).to(self._job.device) for value in self._ground.stretches(batch))
+        return self._descend(replace(self._rays(batch), ends_m=end_m), targets, sampling, start_m)
+
+    @property
+    def passes(self) -> int:
+        """How often samples are placed along a ray."""
+        return len(self._job.settings.sampling.proposal_samples) + 1
+
+    def _random(self, step: int, *size: int) -> Tensor:
+        """Uniform random numbers of a step."""
         # Torch's seed must depend on both: consecutive seeds of the same run never meet those of another.
         self._generator.manual_seed(self._settings.seed << 32 | step)
-        trains_proposals = schedule.trains_proposals(step, self._settings)
-        sampling = Sampling(self._generator, schedule.anneal_exponent(step, self._settings), trains_proposals)
-        stretches = self._ground.stretches(batch) if self._ground else None
-        rendering = self.field(self._rays(batch, stretches), sampling)
-        parts = self._losses(rendering, batch, trains_proposals)
-        if stretches:
-            parts["ground"] = self._settings.ground.weight * self._ground_loss(rendering, stretches)
+        return torch.rand(*size, generator=self._generator, device=self._job.device)
+
+    def _schedule(self, step: int) -> tuple[float, bool]:
+        """The exponent of the proposals' weights, and whether the proposals learn."""
+        return schedule.anneal_exponent(step, self._settings), schedule.trains_proposals(step, self._settings)
+
+    def _descend(
+        self, rays: Rays, targets: Targets, sampling: Sampling, starts_m: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """One step of the optimiser; its losses by name. On a card nothing here may wait for it: see CardRun.
+
+        Where rays show the ground they must not end before `starts_m` (R,), metres; 0: nothing is known.
+        """
+        rendering = self.field(rays, sampling)
+        parts = self._losses(rendering, targets, sampling.train_proposals)
+        if starts_m is not None:
+            middles_m = (rendering.edges_m[:, 1:] + rendering.edges_m[:, :-1]) / 2
+            ground = losses.ground_loss(rendering.field.weights, middles_m, starts_m)
+            parts["ground"] = self._settings.ground.weight * ground
         torch.stack(list(parts.values())).sum().backward()
         self._optimiser.step()
         self._optimiser.zero_grad()
+        self.field.refresh_copies()
         return {name: part.detach() for name, part in parts.items()}
 
     def save(self, step: int, figures: dict[str, float]) -> None:
@@ -255,27 +271,18 @@ class Run:
         for name, parameter in self.field.named_parameters():
             self._optimiser.state[parameter] = {quantity: values[name] for quantity, values in state.items()}
 
-    def _rays(self, batch: PixelBatch, stretches: Stretches | None) -> Rays:
+    def _rays(self, batch: PixelBatch) -> Rays:
         videos, images = self._videos[batch.rows], self._images[batch.rows]
-        rays = self.field.rays(batch.origins_world, batch.directions_world, videos, images)
-        return replace(rays, ends_m=torch.from_numpy(stretches.end_m).to(self._job.device)) if stretches else rays
+        return self.field.rays(batch.origins_world, batch.directions_world, videos, images)
 
-    def _ground_loss(self, rendering: Rendering, stretches: Stretches) -> Tensor:
-        middles_m = (rendering.edges_m[:, 1:] + rendering.edges_m[:, :-1]) / 2
-        start_m = torch.from_numpy(stretches.start_m).to(self._job.device)
-        return losses.ground_loss(rendering.field.weights, middles_m, start_m)
-
-    def _losses(self, rendering: Rendering, batch: PixelBatch, trains_proposals: bool) -> dict[str, Tensor]:
+    def _losses(self, rendering: Rendering, targets: Targets, trains_proposals: bool) -> dict[str, Tensor]:
         """The five losses (paper, section 3.2), weighted."""
-        weights = self._settings.loss
-        rgb, features, labels = (
-            torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.features, batch.labels)
-        )
-        known = labels != classes.UNKNOWN
+        weights, labels = self._settings.loss, targets.labels
+        sky = losses.sky_loss(rendering.accumulation, labels == classes.SKY, labels != classes.UNKNOWN)
         parts = {
-            "rgb": functional.mse_loss(rendering.rgb, rgb / 255),
-            "features": weights.features * losses.feature_loss(rendering.features, features / 255),
-            "sky": weights.sky * losses.sky_loss(rendering.accumulation[known], labels[known] == classes.SKY),
+            "rgb": functional.mse_loss(rendering.rgb, targets.rgb / 255),
+            "features": weights.features * losses.feature_loss(rendering.features, targets.features / 255),
+            "sky": weights.sky * sky,
             "distortion": weights.distortion * losses.distortion_loss(rendering.field.edges, rendering.field.weights),
         }
         if trains_proposals:
@@ -316,6 +323,7 @@ class _Log:
         self._writer = SummaryWriter(scratch / "tensorboard")
         self._sums: dict[str, Tensor] = {}
         self._steps = 0
+        self._waited_s = self._waited_before_s = 0.0  # for batches, in all; up to the last report
         self._started = time.perf_counter()
 
     def __enter__(self) -> "_Log":
@@ -324,8 +332,9 @@ class _Log:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
-    def add(self, step: int, parts: dict[str, Tensor]) -> None:
-        """Note a step's losses; every half second they are reported."""
+    def add(self, step: int, parts: dict[str, Tensor], waited_s: float) -> None:
+        """Note a step's losses, and how long all steps waited for batches; every half second they are reported."""
+        self._waited_s = waited_s
         for name, part in parts.items():
             self._sums[name] = self._sums.get(name, torch.zeros_like(part)) + part
         self._steps += 1
@@ -345,7 +354,13 @@ class _Log:
                 f"tile {self._job.tile_id}: the loss is {loss} at step {step}; lower training.learning_rate ({rate})"
             )
         rays_per_s = self._steps * self._job.settings.training.batch_rays / seconds
-        self.figures = {"loss": loss, "psnr_db": -10 * float(np.log10(means["rgb"])), "rays_per_s": rays_per_s}
+        self.figures = {
+            "loss": loss,
+            "psnr_db": -10 * float(np.log10(means["rgb"])),
+            "rays_per_s": rays_per_s,
+            "waiting_share": (self._waited_s - self._waited_before_s) / seconds,
+        }
+        self._waited_before_s = self._waited_s
         for name, value in {**{f"loss/{name}": mean for name, mean in means.items()}, **self.figures}.items():
             self._writer.add_scalar(name, value, step + 1)
         self._report(Progress("training", step + 1, self._job.settings.training.steps, dict(self.figures)))

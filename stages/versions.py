@@ -3,6 +3,6 @@
 A raised number makes every tile built with the old one stale.
 """
 
-FEATURES = 1
-TRAINING = 2
-EXTRACTION = 1
+FEATURES = 2
+TRAINING = 3
+EXTRACTION = 2

@@ -4,10 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from presight_core.config import CitySettings
 from presight_core.drives import FrameTable
 from presight_core.errors import NotFoundError
 from presight_core.images import read_rgb, resized
+from presight_core.masking import masked_labels
 from presight_core.pixels import FramePixels, PixelSource
 from storage.features import FeatureCache
 
@@ -16,24 +19,39 @@ class CachedPixels(PixelSource):
     """Loads the rows of one FrameTable; safe to call from several threads."""
 
     def __init__(
-        self, frames: FrameTable, roots: Mapping[str, str | Path], cache: FeatureCache, key: str, image_scale: float
+        self, frames: FrameTable, roots: Mapping[str, str | Path], cache: FeatureCache, key: str, settings: CitySettings
     ):
-        """`roots` gives the data set's folder of each drive; images are shrunk to `image_scale` of their size.
+        """`roots` gives the data set's folder of each drive; `settings` how small images are and what is masked.
 
         Raises NotFoundError if a frame is not in the feature cache under `key`.
         """
-        self._frames, self._cache, self._key, self._scale = frames, cache, key, image_scale
+        self._frames, self._cache, self._key, self._settings = frames, cache, key, settings
         self._roots = {drive_id: Path(root) for drive_id, root in roots.items()}
         self._cache_rows = _cache_rows(frames, cache, key)
 
     def load(self, row: int) -> FramePixels:
-        """Decode one row. Raises InputError if the image cannot be read or was rejected by the feature stage."""
-        frames, drive_id = self._frames, str(self._frames.drive_id[row])
+        """Decode one row; what is masked has a dynamic class.
+
+        Raises InputError if the image cannot be read or was rejected by the feature stage.
+        """
+        drive_id = str(self._frames.drive_id[row])
         layers = self._cache.read(self._key, drive_id, int(self._cache_rows[row]))
+        rgb = self._load_rgb(row)
+        return FramePixels(rgb, masked_labels(layers.labels, rgb, self._settings.features), layers.features)
+
+    def load_labels(self, row: int) -> NDArray[np.uint8]:
+        """The labels of `load` alone, at a fraction of its cost where masks need no image."""
+        labels = self._cache.read_labels(self._key, str(self._frames.drive_id[row]), int(self._cache_rows[row]))
+        needs_image = self._settings.features.mask_shadows
+        rgb = self._load_rgb(row) if needs_image else np.zeros((1, 1, 3), np.uint8)
+        return masked_labels(labels, rgb, self._settings.features)
+
+    def _load_rgb(self, row: int) -> NDArray[np.uint8]:
+        frames = self._frames
         width, height = int(frames.width_px[row]), int(frames.height_px[row])
-        rgb = read_rgb(self._roots[drive_id] / str(frames.path[row]), width, height)
-        rgb = resized(rgb, max(1, round(width * self._scale)), max(1, round(height * self._scale)))
-        return FramePixels(rgb, layers.labels, layers.features)
+        rgb = read_rgb(self._roots[str(frames.drive_id[row])] / str(frames.path[row]), width, height)
+        scale = self._settings.training.image_scale
+        return resized(rgb, max(1, round(width * scale)), max(1, round(height * scale)))
 
 
 def _cache_rows(frames: FrameTable, cache: FeatureCache, key: str) -> np.ndarray:

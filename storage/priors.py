@@ -104,11 +104,7 @@ class PriorStore:
             head = self.generation(city)
             _check_fence(city, head, fence)
             self._check_meanwhile(city, tiles, parent, head, tiling)
-            generation = replace(
-                _next(facts, head, tiles, tiling),
-                parent_sha256=self._sha256(head),
-                fence=max(fence or 0, head.fence if head else 0),
-            )
+            generation = replace(_next(facts, head, tiles, tiling), fence=max(fence or 0, head.fence if head else 0))
             if self._commit(generation):
                 return generation.number
         raise ConflictError(f"{city}: {MOST_ATTEMPTS} other generations came first; run it again")
@@ -129,7 +125,7 @@ class PriorStore:
                 return
             empty = {"tiling_id": "none", "city": city, "tiles": []}  # nothing is published yet
             following = _next(facts, head, {}, head.tiling if head else empty)
-            if self._commit(replace(following, parent_sha256=self._sha256(head), fence=fence)):
+            if self._commit(replace(following, fence=fence)):
                 return
         raise ConflictError(f"{city}: {MOST_ATTEMPTS} other generations came first; run it again")
 
@@ -139,9 +135,11 @@ class PriorStore:
         return head.fence if head else 0
 
     def _commit(self, generation: Generation) -> bool:
-        """Put the generation if its number is free; False if somebody else has it."""
-        content = encode(generation.to_json())
-        path = generation_path(generation.city, generation.number)
+        """Put the generation, chained to its parent's bytes, if its number is free; False if somebody else has it."""
+        path, parent = generation_path(generation.city, generation.number), generation.parent
+        before = self._source.read(generation_path(generation.city, parent)) if parent else None
+        parent_sha256 = None if before is None else hashlib.sha256(before).hexdigest()
+        content = encode(replace(generation, parent_sha256=parent_sha256).to_json())
         # A put whose answer was lost may have landed: then what is there is our own document.
         return put_once(self._objects, path, content) or self._source.read(path) == content
 
@@ -158,8 +156,11 @@ class PriorStore:
     def tag(self, city: str, tag: str, number: int | None = None) -> int:
         """Name a generation, the newest if not given, for good: readers may ask for it, and nothing of it is deleted.
 
-        Its number. Raises ConflictError if the tag stands for another one, NotFoundError without such a generation.
+        Its number. Raises ConflictError if the tag stands for another one, NotFoundError without such a generation,
+        InputError for a tag of digits, which would be taken for a generation's number.
         """
+        if tag.isdigit():
+            raise InputError(f"{city}: tag {tag} reads like a generation; use a name such as release-{tag}")
         generation = read_generation(self._source, city, number)
         self.save_document(city, "tags", tag, {"generation": generation.number})
         return generation.number
@@ -181,14 +182,7 @@ class PriorStore:
         StoreError if a build of it is gone.
         """
         old, head = read_generation(self._source, city, number), read_generation(self._source, city, None)
-        new = replace(
-            old,
-            number=head.number + 1,
-            parent=head.number,
-            parent_sha256=self._sha256(head),
-            restores=number,
-            fence=head.fence,
-        )
+        new = replace(old, number=head.number + 1, parent=head.number, restores=number, fence=head.fence)
         self._check_builds(self.city(city), old.tiles)
         if not self._commit(new):
             raise ConflictError(f"{city}: generation {new.number} came first; look at it, then run it again")
@@ -226,13 +220,6 @@ class PriorStore:
         if content is None:
             raise NotFoundError(f"{self.location} has no {path}; save it first")
         return decode(content, f"{self.location}/{path}", _without_version)
-
-    def _sha256(self, generation: Generation | None) -> str | None:
-        """The digest of a generation's file, which the next one carries."""
-        if generation is None:
-            return None
-        content = self._source.read(generation_path(generation.city, generation.number))
-        return hashlib.sha256(content or b"").hexdigest()
 
     def _check_builds(self, facts: CityDocument, tiles: Mapping[str, GenerationTile | None]) -> None:
         for tile_id, tile in tiles.items():

@@ -152,9 +152,9 @@ class _ArrayWriter:
     def _write(self, rows: NDArray) -> None:
         """Store rows, of which all but the last ones of the array fill whole chunks; chunks go side by side."""
         self.digest.update(np.ascontiguousarray(rows).astype(rows.dtype.newbyteorder("<"), copy=False).data)
-        failpoint("slab-before-write")
         self.row_count += len(rows)
         size = self.spec.chunk_rows
+        failpoint("slab-before-write")
         pieces = [rows[first : first + size] for first in range(0, len(rows), size)]
         numbers = range(len(self.checksums), len(self.checksums) + len(pieces))
         self.checksums += self.pool.map(self._write_chunk, pieces, numbers)

@@ -28,7 +28,7 @@ class Assignment:
 
     def sort(self, values: Tensor) -> Tensor:
         """Rows (N, ...) of the original order, sorted by sub-field."""
-        return values if self.order is None else values[self.order]
+        return values if self.order is None else _Permutation.apply(values, self.order, self.places)  # type: ignore[return-value]
 
     def restore(self, values: Tensor) -> Tensor:
         """Rows (N, ...) sorted by sub-field, in the original order."""

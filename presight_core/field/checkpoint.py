@@ -6,18 +6,20 @@ beside a field is a copy for people.
 
 import json
 import os
-from collections.abc import Mapping
+import struct
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import safetensors
-import safetensors.torch
+import torch
 from torch import Tensor
 
 from presight_core.errors import InputError, NotFoundError
 from presight_core.field.tile_field import FieldShape, TileField
 
 FIELD_FILE = "field.safetensors"
+TYPE_NAMES = {torch.float32: "F32", torch.int64: "I64"}  # parameters and optimisers hold no others
 FIELD_VERSION = 1  # of the parameters' names and meaning
 
 
@@ -43,10 +45,19 @@ def load_field(folder: Path, device: str = "cpu") -> TileField:
 
 
 def save_tensors(file: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
-    """Write tensors and a JSON header to one file: wholly, or not at all."""
-    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    metadata = {"header": json.dumps(header)}
-    _replace(file, lambda partial: safetensors.torch.save_file(contiguous, partial, metadata))
+    """Write tensors and a JSON header to one file: wholly, or not at all.
+
+    One tensor after the other comes from its device: a large tile's optimiser state need not fit into memory.
+    """
+    entries: dict[str, Any] = {"__metadata__": {"header": json.dumps(header)}}
+    end = 0
+    for name, tensor in tensors.items():
+        start, end = end, end + tensor.numel() * tensor.element_size()
+        kind = TYPE_NAMES[tensor.dtype]
+        entries[name] = {"dtype": kind, "shape": list(tensor.shape), "data_offsets": [start, end]}
+    text = json.dumps(entries).encode()
+    text += b" " * (-len(text) % 8)  # so that the tensors are aligned
+    _replace(file, lambda partial: _write(partial, text, tensors.values()))
 
 
 def load_tensors(file: Path, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -62,6 +73,15 @@ def load_tensors(file: Path, device: str = "cpu") -> tuple[dict[str, Tensor], di
             return {name: opened.get_tensor(name) for name in opened.keys()}, header  # noqa: SIM118 - not a dict
     except (safetensors.SafetensorError, KeyError, ValueError) as error:
         raise InputError(f"{file} is damaged ({error}); delete it and train the tile again") from error
+
+
+def _write(file: Path, header: bytes, tensors: Iterable[Tensor]) -> None:
+    """The format of safetensors: the header's length, the header, the tensors."""
+    with file.open("wb") as stream:
+        stream.write(struct.pack("<Q", len(header)))
+        stream.write(header)
+        for tensor in tensors:
+            tensor.detach().cpu().contiguous().numpy().tofile(stream)
 
 
 def _replace(file: Path, write: Any) -> None:

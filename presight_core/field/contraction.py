@@ -1,7 +1,10 @@
 """All of space, squeezed into the unit cube that a hash grid covers."""
 
+import numba
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from numba import prange
 from torch import Tensor
 
 
@@ -25,3 +28,36 @@ def grid_position(
     unit = (contract((points_field - centre) / half_size) + 2) / 4
     inside = ((unit > 0) & (unit < 1)).all(-1)
     return torch.where(inside[..., None], unit, 0), inside
+
+
+def grid_positions(
+    points_field: Float[Tensor, "points 3"],
+    segments: Int[Tensor, " sub_fields+1"],
+    centres: Float[Tensor, "sub_fields 3"],
+    half_sizes: Float[Tensor, "sub_fields 3"],
+) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
+    """`grid_position` of points sorted by sub-field, in one pass on a CPU; no gradient reaches the points."""
+    positions = torch.empty_like(points_field)
+    inside = torch.empty(len(points_field), dtype=torch.bool)
+    tensors = (points_field.detach().contiguous(), segments, centres, half_sizes, positions, inside)
+    _fill_positions(*(tensor.numpy() for tensor in tensors))
+    return positions, inside
+
+
+@numba.njit(parallel=True, cache=True, error_model="numpy")
+def _fill_positions(points, segments, centres, half_sizes, positions, inside):
+    one, two, quarter = np.float32(1), np.float32(2), np.float32(0.25)
+    for sub_field in range(len(centres)):
+        centre, half = centres[sub_field], half_sizes[sub_field]
+        for i in prange(segments[sub_field], segments[sub_field + 1]):
+            x = (points[i, 0] - centre[0]) / half[0]
+            y = (points[i, 1] - centre[1]) / half[1]
+            z = (points[i, 2] - centre[2]) / half[2]
+            norm = max(abs(x), abs(y), abs(z), one)
+            factor = (two - one / norm) / norm
+            x, y, z = (x * factor + two) * quarter, (y * factor + two) * quarter, (z * factor + two) * quarter
+            within = min(x, y, z) > 0 and max(x, y, z) < one
+            inside[i] = within
+            positions[i, 0] = x if within else 0
+            positions[i, 1] = y if within else 0
+            positions[i, 2] = z if within else 0

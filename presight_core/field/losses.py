@@ -9,25 +9,37 @@ Edges = Float[Tensor, "rays edges"]
 Weights = Float[Tensor, "rays bins"]
 
 
+GROUND_SLACK = 0.1  # see `ground_loss`
+
+
 def feature_loss(rendered: Tensor, target: Tensor) -> Tensor:
     """Mean squared error of features; the target is clipped to [0, 1], the range of the feature space."""
     return functional.mse_loss(rendered, target.clamp(0, 1))
 
 
-def sky_loss(accumulation: Float[Tensor, " rays"], is_sky: Bool[Tensor, " rays"]) -> Tensor:
-    """Binary cross-entropy: rays of the sky should end nowhere, all others somewhere."""
+def sky_loss(
+    accumulation: Float[Tensor, " rays"], is_sky: Bool[Tensor, " rays"], is_known: Bool[Tensor, " rays"] | None = None
+) -> Tensor:
+    """Binary cross-entropy: rays of the sky should end nowhere, all others somewhere.
+
+    The mean over rays whose label `is_known`; 0 if none is. A product, because picking rays out would make shapes
+    depend on values.
+    """
     # The bound of half a float32 step below 1 keeps both logarithms finite.
     bounded = accumulation.clamp(1e-7, 1 - 1e-7)
-    return -torch.where(is_sky, 1 - bounded, bounded).log().mean()
+    entropy = -torch.where(is_sky, 1 - bounded, bounded).log()
+    return entropy.mean() if is_known is None else (entropy * is_known).sum() / is_known.sum().clamp_min(1)
 
 
 def ground_loss(
     weights: Weights, middles_m: Float[Tensor, "rays bins"], start_m: Float[Tensor, " rays"]
 ) -> Float[Tensor, ""]:
-    """Negative logarithm of the weight beyond `start_m`, mean over rays; rays that start at 0 cost nothing."""
+    """Negative logarithm of the weight beyond `start_m`, mean over rays; rays that start at 0 cost nothing.
+
+    A tenth is added to the weight, so that a pixel with a wrong label pulls ten times as hard as a right one at most.
+    """
     beyond = (weights * (middles_m > start_m[:, None])).sum(-1)
-    # Below a thousandth the slope would be steeper than is good for a step.
-    return torch.where(start_m > 0, -beyond.clamp(1e-3, 1).log(), 0).mean()
+    return torch.where(start_m > 0, -((beyond + GROUND_SLACK) / (1 + GROUND_SLACK)).log(), 0).mean()
 
 
 def distortion_loss(edges: Edges, weights: Weights) -> Tensor:

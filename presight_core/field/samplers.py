@@ -25,7 +25,9 @@ class Spacing:
         return metres_from_spacing(s * far + (1 - s) * near, self.linear_m)
 
     def _spaced(self, metres: float | Tensor, like: Tensor) -> Tensor:
-        return spacing_from_metres(torch.as_tensor(metres, dtype=like.dtype, device=like.device), self.linear_m)
+        if not isinstance(metres, Tensor):  # written by the device itself: a copy would have to wait for the host
+            metres = torch.full((), metres, dtype=like.dtype, device=like.device)
+        return spacing_from_metres(metres.to(like), self.linear_m)
 
 
 def far_above_floor(

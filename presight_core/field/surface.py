@@ -9,8 +9,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from presight_core.field import rendering
-from presight_core.field.tile_field import Rays, Sampling, TileField
+from presight_core.field.rays import Rays
+from presight_core.field.tile_field import Sampling, TileField
 
+UNSEEN = 1e-3  # share of a ray that is not followed further: at most 1 m of an expected depth, if it went on to 1,000 m
+HIT = 0.49  # likewise for the first hit, which is where one half is left; the hundredth is for rounding
 CHUNK_RAYS = 8192  # activations of a chunk stay near 100 MB at 128 samples
 
 
@@ -71,10 +74,10 @@ def _surface_of_chunk(
 
 def _depth(field: TileField, rays: Rays, surface: str) -> tuple[Tensor, Tensor]:
     """Depth (R,) of the surface along each ray, and whether there is one."""
-    _, edges = field.place_samples(rays, Sampling())
+    _, edges = field.place_samples(rays, Sampling(left=UNSEEN))
     edges_m = field.spacing(rays).metres(edges)
-    weights = rendering.ray_weights(field.density(rays.points(edges_m)), edges_m.diff(dim=-1))
-    depth, found = rendering.first_hit_depth(weights, edges_m)
     if surface == "expected":
-        depth = rendering.expected_depth(weights, (edges_m[:, 1:] + edges_m[:, :-1]) / 2)
-    return depth, found
+        weights = field.weights(rays, edges_m, UNSEEN)
+        _, found = rendering.first_hit(weights)
+        return rendering.expected_depth(weights, (edges_m[:, 1:] + edges_m[:, :-1]) / 2), found
+    return rendering.first_hit_depth(field.weights(rays, edges_m, HIT), edges_m)

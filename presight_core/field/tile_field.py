@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from presight_core.config import FieldSettings, GridSettings, SamplingSettings
 from presight_core.field import rendering, samplers
 from presight_core.field.assignment import Assignment, assign
-from presight_core.field.contraction import grid_position
+from presight_core.field.contraction import grid_position, grid_positions
+from presight_core.field.early_stop import weights_until
 from presight_core.field.hash_grid import HashGrid
 from presight_core.field.mlp import SubFieldMlp
+from presight_core.field.rays import Rays
 from presight_core.field.spherical_harmonics import HARMONICS, spherical_harmonics
 from presight_core.tiles import SubField
 
@@ -57,22 +59,6 @@ class FieldShape:
 
 
 @dataclass(frozen=True)
-class Rays:
-    """Rays in the field frame. Without videos or images the mean of all their embeddings is used."""
-
-    origins: Float[Tensor, "rays 3"]
-    directions: Float[Tensor, "rays 3"]  # unit length
-    videos: Int[Tensor, " rays"] | None = None
-    images: Int[Tensor, " rays"] | None = None
-    ends_m: Float[Tensor, " rays"] | None = None  # nothing lies beyond; None or inf: the far plane
-
-    def points(self, edges_m: Float[Tensor, "rays edges"]) -> Float[Tensor, "rays samples 3"]:
-        """The middle of each stretch between two edges."""
-        middles = (edges_m[:, 1:] + edges_m[:, :-1]) / 2
-        return self.origins[:, None] + middles[..., None] * self.directions[:, None]
-
-
-@dataclass(frozen=True)
 class Histogram:
     """Where rays end: weights of the stretches between edges, which are in s (see samplers)."""
 
@@ -84,9 +70,10 @@ class Histogram:
 class Sampling:
     """How samples are placed in one pass. The default is that of evaluation: nothing random."""
 
-    generator: torch.Generator | None = None  # None: no jitter
-    anneal: float = 1.0  # exponent of the proposals' weights; below 1 they are flattened
+    jitter: Float[Tensor, "rays passes"] | None = None  # in [0, 1), a column for each proposal and the field; or none
+    anneal: float | Tensor = 1.0  # exponent of the proposals' weights; below 1 they are flattened
     train_proposals: bool = False
+    left: float = 0.0  # a ray is followed until this share of it is left; the proposals' samples beyond weigh nothing
 
 
 @dataclass(frozen=True)
@@ -122,9 +109,9 @@ class DensityNetwork(nn.Module):
         self.grid = HashGrid(grid, sub_field_count)
         self.network = SubFieldMlp(sub_field_count, (self.grid.output_width, width, outputs))
 
-    def forward(self, positions: Tensor, assignment: Assignment) -> Tensor:
-        """Outputs (N, outputs) at positions (N, 3) of the grids, sorted by sub-field."""
-        return self.network(self.grid(positions, assignment.segments), assignment)
+    def forward(self, positions: Tensor, assignment: Assignment, outputs: int | None = None) -> Tensor:
+        """The first `outputs` (N, outputs), or all, at positions (N, 3) of the grids, sorted by sub-field."""
+        return self.network(self.grid(positions, assignment.segments), assignment, outputs)
 
 
 class TileField(nn.Module):
@@ -172,6 +159,18 @@ class TileField(nn.Module):
             if isinstance(module, SubFieldMlp):
                 module.dtype = dtype
 
+    def use_copies(self, dtype: torch.dtype) -> None:
+        """Let the hash grids read rounded copies of their tables; after each step `refresh_copies` renews them."""
+        for module in self.modules():
+            if isinstance(module, HashGrid):
+                module.copy = module.table.detach().to(dtype)
+
+    def refresh_copies(self) -> None:
+        """Round the tables again, where there are copies."""
+        for module in self.modules():
+            if isinstance(module, HashGrid) and module.copy is not None:
+                module.copy.copy_(module.table.detach())
+
     def rays(
         self,
         origins_world: NDArray[np.float64],
@@ -218,7 +217,8 @@ class TileField(nn.Module):
         if settings.floor_m is not None:
             far_m = samplers.far_above_floor(rays.directions, far_m, settings.floor_m, settings.floor_slope)
         if rays.ends_m is not None:
-            far_m = torch.minimum(rays.ends_m[:, None], torch.as_tensor(far_m, device=rays.ends_m.device))
+            ends_m = rays.ends_m[:, None]
+            far_m = torch.minimum(ends_m, far_m) if isinstance(far_m, Tensor) else ends_m.clamp_max(far_m)
         return samplers.Spacing(settings.near_m, far_m, settings.linear_m)
 
     def place_samples(
@@ -226,17 +226,16 @@ class TileField(nn.Module):
     ) -> tuple[tuple[Histogram, ...], Float[Tensor, "rays edges"]]:
         """Histograms of the proposals, and the edges (in s) of the samples that they ask for."""
         counts = (*self.shape.sampling.proposal_samples, self.shape.sampling.field_samples)
-        edges = samplers.uniform_edges(len(rays.origins), counts[0], self._jitter(rays, sampling), rays.origins)
+        jitter = [None] * len(counts) if sampling.jitter is None else sampling.jitter.split(1, -1)
+        edges = samplers.uniform_edges(len(rays.origins), counts[0], jitter[0], rays.origins)
         histograms, spacing = [], self.spacing(rays)
-        for proposal, count in zip(self.proposals, counts[1:], strict=True):
+        for number, (proposal, count) in enumerate(zip(self.proposals, counts[1:], strict=True), 1):
             edges_m = spacing.metres(edges)
             with torch.set_grad_enabled(sampling.train_proposals and torch.is_grad_enabled()):
-                density = self._density(proposal, rays.points(edges_m))
-                weights = rendering.ray_weights(density, edges_m.diff(dim=-1))
+                weights = self._weights(proposal, rays, edges_m, sampling.left)
             histograms.append(Histogram(edges, weights))
             flattened = weights.detach() ** sampling.anneal
-            jitter, padding = self._jitter(rays, sampling), self.shape.sampling.padding
-            edges = samplers.resample(edges, flattened, count, jitter, padding)
+            edges = samplers.resample(edges, flattened, count, jitter[number], self.shape.sampling.padding)
         return tuple(histograms), edges
 
     def query(self, points: Float[Tensor, "rays samples 3"], conditions: Float[Tensor, "rays _"]) -> PointValues:
@@ -258,6 +257,12 @@ class TileField(nn.Module):
             assignment.restore(features).float().unflatten(0, shape),
         )
 
+    def weights(
+        self, rays: Rays, edges_m: Float[Tensor, "rays edges"], left: float = 0.0
+    ) -> Float[Tensor, "rays bins"]:
+        """Share of each ray that ends between its edges; nothing beyond where at most `left` of the ray is left."""
+        return self._weights(self.trunk, rays, edges_m, left)
+
     def density(self, points: Float[Tensor, "rays samples 3"]) -> Float[Tensor, "rays samples"]:
         """Density per metre at points."""
         return self._density(self.trunk, points)
@@ -269,14 +274,21 @@ class TileField(nn.Module):
     def conditions(self, rays: Rays) -> Float[Tensor, "rays _"]:
         """What colour depends on beside the place: direction, video and image."""
         embeddings = [
-            table.weight.mean(0).expand(len(rays.origins), -1) if numbers is None else table(numbers)
+            table.weight.mean(0).expand(len(rays.origins), -1)
+            if numbers is None
+            else table.weight.index_select(0, numbers)
             for table, numbers in ((self.video_embedding, rays.videos), (self.image_embedding, rays.images))
         ]
         return torch.cat([spherical_harmonics(rays.directions), *embeddings], -1)
 
+    def _weights(self, network: nn.Module, rays: Rays, edges_m: Tensor, left: float) -> Tensor:
+        if left:
+            return weights_until(lambda points: self._density(network, points), rays, edges_m, left)
+        return rendering.ray_weights(self._density(network, rays.points(edges_m)), edges_m.diff(dim=-1))
+
     def _density(self, network: nn.Module, points: Tensor) -> Tensor:
         assignment, positions, inside = self._locate(points)
-        density = network(positions, assignment)[:, 0]
+        density = network(positions, assignment, 1)[:, 0]
         return assignment.restore(self._activate(density, inside)).view(points.shape[:-1])
 
     def _activate(self, output: Tensor, inside: Tensor) -> Tensor:
@@ -288,6 +300,9 @@ class TileField(nn.Module):
         """The sorting by sub-field of points (..., 3), their grid positions (N, 3), and which have one."""
         flat = points.reshape(-1, 3)
         assignment = assign(flat, self.centroids)
+        if points.device.type == "cpu" and not points.requires_grad:
+            boxes = assignment.segments, self.box_centre, self.box_half
+            return assignment, *grid_positions(assignment.sort(flat), *boxes)
         centre, half = assignment.spread(self.box_centre), assignment.spread(self.box_half)
         positions, inside = grid_position(assignment.sort(flat), centre, half)
         return assignment, positions, inside
@@ -299,9 +314,3 @@ class TileField(nn.Module):
         rgb = torch.sigmoid(self.sky_colour(seen, assignment).float())
         features = self.sky_features(seen[:, :HARMONICS], assignment).float()
         return assignment.restore(rgb), assignment.restore(features)
-
-    def _jitter(self, rays: Rays, sampling: Sampling) -> Tensor | None:
-        if sampling.generator is None:
-            return None
-        device = rays.origins.device
-        return torch.rand(len(rays.origins), 1, generator=sampling.generator, device=device)

@@ -35,9 +35,10 @@ class SubFieldLayers(torch.autograd.Function):
         layers = tuple(layer.to(dtype) if layer.ndim == 3 else layer for layer in layers)
         ctx.save_for_backward(inputs, segments, *layers)
         output = inputs.new_empty(len(inputs), layers[-1].shape[1], dtype=dtype)
-        _forward[(_block_count(inputs, segments, BLOCK),)](
-            inputs, segments, *_three(layers), output, **_constants(layers, segments), num_warps=WARPS
-        )
+        with torch.cuda.device_of(inputs):  # Triton launches on the present device
+            _forward[(_block_count(inputs, segments, BLOCK),)](
+                inputs, segments, *_three(layers), output, **_constants(layers, segments), num_warps=WARPS
+            )
         return output
 
     @staticmethod
@@ -46,10 +47,11 @@ class SubFieldLayers(torch.autograd.Function):
         gradient = gradients[0].contiguous()
         of_inputs = torch.empty_like(inputs)
         of_layers = [torch.zeros_like(layer, dtype=torch.float32) for layer in layers]
-        _backward[(_block_count(inputs, segments, BLOCK * BLOCKS_BACK),)](
-            inputs, segments, *_three(layers), gradient, of_inputs, *_three(of_layers),
-            **_constants(layers, segments), blocks=BLOCKS_BACK, num_warps=WARPS_BACK, num_stages=STAGES_BACK,
-        )  # fmt: skip
+        with torch.cuda.device_of(inputs):  # Triton launches on the present device
+            _backward[(_block_count(inputs, segments, BLOCK * BLOCKS_BACK),)](
+                inputs, segments, *_three(layers), gradient, of_inputs, *_three(of_layers),
+                **_constants(layers, segments), blocks=BLOCKS_BACK, num_warps=WARPS_BACK, num_stages=STAGES_BACK,
+            )  # fmt: skip
         return of_inputs, None, None, *of_layers
 
 

@@ -1,4 +1,4 @@
-"""The prior's format: what is stored, and how a consumer reads it. Needs numpy, zarr and obstore only."""
+"""The prior's format: what is stored, and how a consumer reads it. Needs no Zarr library."""
 
 from presight_core.priors.reader import PriorReader
 from presight_core.priors.window import Window

@@ -7,6 +7,7 @@ They are handled here without one: docs/decisions/008 tells why.
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable
+from functools import lru_cache
 from typing import Any
 
 import google_crc32c
@@ -99,11 +100,18 @@ class ChunkCache:
             while self.size_bytes > self._limit_bytes:
                 self.size_bytes -= self._chunks.popitem(last=False)[1].nbytes
 
+    def clear(self) -> None:
+        """Forget everything."""
+        with self._lock:
+            self._chunks.clear()
+            self.size_bytes = 0
+
 
 def _stored_dtype(spec: ArraySpec) -> np.dtype:
     return np.dtype(spec.dtype).newbyteorder("<")
 
 
+@lru_cache
 def _compressor(spec: ArraySpec) -> Blosc | Zstd:
     """Words are shuffled, so that their high bytes, mostly zero, lie together; single bytes need no Blosc."""
     size = np.dtype(spec.dtype).itemsize

@@ -43,7 +43,8 @@ class ReadLocation:
         """The content of one object; None if there is none."""
         try:
             if isinstance(self._place, Path):
-                return (self._place / path).read_bytes()
+                with open(f"{self._place}/{path}", "rb", buffering=0) as file:  # noqa: PTH123 - Path joins cost as much as the read
+                    return file.readall()
             return bytes(obstore.get(self._place, path).bytes())
         except FileNotFoundError:
             return None
@@ -61,7 +62,9 @@ class ReadLocation:
             if isinstance(self._place, Path):
                 return sorted(entry.name for entry in (self._place / folder).iterdir() if entry.is_file())
             objects = obstore.list_with_delimiter(self._place, folder)["objects"]
-            return sorted(entry["path"].rpartition("/")[2] for entry in objects)
+            # Some servers list a folder that was emptied as an object of the folder's own name.
+            paths = [entry["path"] for entry in objects if entry["path"].startswith(f"{folder}/")]
+            return sorted(path.rpartition("/")[2] for path in paths)
         except FileNotFoundError:
             return []
         except (OSError, BaseError) as error:

@@ -41,7 +41,7 @@ class PriorReader:
         self._cache_bytes = cache_bytes
         self._unbuilt = _unbuilt_tiles(generation)
         self.generation = generation
-        self._forget()
+        self._start()
 
     @staticmethod
     def open(
@@ -125,7 +125,7 @@ class PriorReader:
     def tile(self, tile_id: str) -> TileTable:
         """One tile's table, opened when first asked for. Raises NotFoundError for a tile not in the generation."""
         if self._pid != os.getpid():  # a fork: share no connection and no lock with the parent
-            self._forget()
+            self._start()
         if tile_id not in self.generation.tiles:
             raise NotFoundError(f"{self._city.city} generation {self.generation.number} has no tile {tile_id}")
         if tile_id not in self._tables:
@@ -158,7 +158,11 @@ class PriorReader:
         nearest = np.linalg.norm(places[:, None] - centroids, axis=-1).argmin(1)
         return tuple(sorted({names[place] for place in nearest} & self._unbuilt))
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
+        """Let go of every decoded chunk, to give the memory back; the tables of blocks stay."""
+        self._cache.clear()
+
+    def _start(self) -> None:
         self._tables: dict[str, TileTable] = {}
         self._cache = ChunkCache(self._cache_bytes)
         self._pid = os.getpid()
@@ -168,7 +172,7 @@ class PriorReader:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._forget()
+        self._start()
 
 
 def read_city(source: ReadLocation, city: str) -> CityDocument:

@@ -138,8 +138,8 @@ def pack_features(features: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
 
 
 def unpack_features(codes: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-    """Features (N, C), 255 = 1.0, of their codes; wrong by at most `step` // 2."""
-    return codes * np.uint8(step)
+    """Turns codes, in place, into features (N, C), 255 = 1.0; wrong by at most `step` // 2."""
+    return np.multiply(codes, np.uint8(step), out=codes)
 
 
 def pack_columns(observed: NDArray[np.bool_]) -> NDArray[np.uint8]:

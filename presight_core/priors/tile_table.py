@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,14 +103,15 @@ class TileTable:
         places = self.find(blocks)
         if not len(places):
             return None
-        rows = self.rows_of(places)
-        points_world = self._points(rows, places)
+        points_world = self._points(self._spans(places))
         points_ego, inside = box.inside(points_world)
+        rows = self.rows_of(places)
         if not set(self.drives).isdisjoint(without_drives):
             inside &= self._seen_by_others(rows, without_drives)
         kept = np.flatnonzero(inside)
         columns = self.columns(LOOK_ARRAYS, rows[kept])
-        columns |= {"points_world": points_world[kept], "points_ego": points_ego[kept].astype(np.float32)}
+        columns["points_world"] = np.take(points_world.T, kept, axis=1).T
+        columns["points_ego"] = np.take(points_ego.T, kept, axis=1).T.astype(np.float32)
         return TilePart(columns, self.block_index[places], unpack_columns(self.observed[places]))
 
     def rows_of(self, places: NDArray[np.intp]) -> NDArray[np.int64]:
@@ -121,9 +122,14 @@ class TileTable:
 
     def columns(self, names: Sequence[str], rows: NDArray[np.int64]) -> dict[str, NDArray]:
         """The given ascending rows of some arrays; every chunk that holds one is read once."""
-        needed = {name: _chunk_edges(rows, self.arrays[name].spec.chunk_rows) for name in names}
-        chunks = self.load([(name, number) for name, edges in needed.items() for number, _, _ in edges])
-        return {name: self._gather(name, rows, needed[name], chunks) for name in names}
+        pieces = {size: _pieces(rows, size) for size in {self.arrays[name].spec.chunk_rows for name in names}}
+        wanted = {name: pieces[self.arrays[name].spec.chunk_rows] for name in names}
+        chunks = self.load([(name, piece.chunk) for name in names for piece in wanted[name]])
+        return {name: self._gather(name, len(rows), wanted[name], chunks) for name in names}
+
+    def points(self, first: int = 0, last: int | None = None) -> NDArray[np.float64]:
+        """World points (N, 3), metres, of the rows from first to last, which is all of them if not given."""
+        return self._points([(first, int(self.block_start[-1]) if last is None else last)])
 
     def rows(self, name: str, rows: NDArray[np.int64]) -> NDArray:
         """The given ascending rows of one array."""
@@ -133,47 +139,83 @@ class TileTable:
         """A whole array."""
         return self.rows(name, np.arange(self.arrays[name].row_count))
 
-    def load(self, wanted: Sequence[tuple[str, int]]) -> Chunks:
-        """Decoded chunks, by array and number: from the cache, or else read together."""
+    def load(self, wanted: Sequence[tuple[str, int]], keep: bool = True) -> Chunks:
+        """Decoded chunks, by array and number: from the cache, or else read together, and kept there if asked."""
         found = {key: chunk for key in wanted if (chunk := self.cache.get((self.name, *key))) is not None}
         missing = [key for key in wanted if key not in found]
         paths = [f"{self.name}/{array}/{chunk_path(number, self.arrays[array].spec)}" for array, number in missing]
         for (array, number), path, content in zip(missing, paths, self.source.read_all(paths), strict=True):
             stored = self.arrays[array]
             chunk = decode_chunk(content, stored.spec, stored.crc32c[number], f"chunk {path}")
-            self.cache.put((self.name, array, number), chunk)
+            if keep:
+                self.cache.put((self.name, array, number), chunk)
             found[array, number] = chunk
         return found
 
     def warm(self, blocks: NDArray[np.int32]) -> None:
         """Read all chunks that windows over the given blocks (N, 2) may need, together, into the cache."""
-        rows = self.rows_of(self.find(blocks))
-        names = PLACE_ARRAYS + LOOK_ARRAYS
-        self.load([(n, chunk) for n in names for chunk, _, _ in _chunk_edges(rows, self.arrays[n].spec.chunk_rows)])
+        places = self.find(blocks)
+        self._points(self._spans(places))
+        rows, size_of = self.rows_of(places), {name: self.arrays[name].spec.chunk_rows for name in LOOK_ARRAYS}
+        self.load([(name, piece.chunk) for name, size in size_of.items() for piece in _pieces(rows, size)])
 
-    def _gather(self, name: str, rows: NDArray[np.int64], edges: list[tuple[int, int, int]], chunks: Chunks) -> NDArray:
+    def _gather(self, name: str, count: int, pieces: list["_Piece"], chunks: Chunks) -> NDArray:
         spec = self.arrays[name].spec
-        result = np.empty((len(rows), *spec.row_shape), spec.dtype)
-        for number, first, last in edges:
-            local = rows[first:last] - number * spec.chunk_rows
-            np.take(chunks[name, number], local, axis=0, out=result[first:last], mode="clip")  # "raise" copies twice
-        return unpack_features(result, self.city.feature_step) if name == "features" else result
+        result = np.empty((count, *spec.row_shape), spec.dtype)
+        for piece in pieces:
+            # mode="raise" would copy twice
+            np.take(chunks[name, piece.chunk], piece.rows, axis=0, out=result[piece.first : piece.last], mode="clip")
+        if name == "features":
+            unpack_features(result, self.city.feature_step)
+        return result
 
-    def _points(self, rows: NDArray[np.int64], places: NDArray[np.intp]) -> NDArray[np.float64]:
-        """World points (N, 3) of all voxels of some blocks: the middle of the centroid's quantisation step."""
-        place = self.columns(PLACE_ARRAYS, rows)
-        word, centroid = place["voxel"].astype(np.int64), place["centroid"]
-        index = [word >> 24, word >> 16 & 0xFF, (word & 0xFFFF) - HEIGHT_OFFSET]
-        counts = np.diff(self.block_start)[places]
-        corners = self.lattice.voxel_min(
-            np.pad(self.block_index[places] * self.lattice.block_columns, ((0, 0), (0, 1)))
-        )
-        points = np.empty((3, len(rows)))  # axes apart: every step below runs over one stretch of memory
-        for axis in range(3):
-            steps = index[axis] * CENTROID_STEPS + centroid[:, axis]
-            np.multiply(steps + 0.5, self.lattice.voxel_m / CENTROID_STEPS, out=points[axis])
-            points[axis] += np.repeat(corners[:, axis], counts)
-        return points.T
+    def _spans(self, places: NDArray[np.intp]) -> list[tuple[int, int]]:
+        """First and end rows of the blocks at the given places, those of neighbours in the table as one."""
+        first, last = self.block_start[places], self.block_start[places + 1]
+        breaks = np.flatnonzero(first[1:] != last[:-1])
+        starts, ends = np.append(first[:1], first[breaks + 1]), np.append(last[breaks], last[-1:])
+        return [(start, end) for start, end in zip(starts.tolist(), ends.tolist(), strict=True) if end > start]
+
+    def _points(self, spans: list[tuple[int, int]]) -> NDArray[np.float64]:
+        """World points (N, 3), metres, of the rows of some spans."""
+        size = self.arrays["voxel"].spec.chunk_rows
+        pieces = [
+            (number, max(first - number * size, 0), min(last - number * size, size))
+            for first, last in spans
+            for number in range(first // size, -(-last // size))
+        ]
+        chunks = self._point_chunks([number for number, _, _ in pieces])
+        parts = [chunks[number][:, first:last] for number, first, last in pieces]
+        return np.concatenate([np.empty((3, 0)), *parts], axis=1).T
+
+    def _point_chunks(self, numbers: Sequence[int]) -> dict[int, NDArray[np.float64]]:
+        """World points (3, rows) of whole chunks: kept in the place of the two arrays that they are made from."""
+        kept = {number: self.cache.get((self.name, "points", number)) for number in numbers}
+        found = {number: points for number, points in kept.items() if points is not None}
+        missing = sorted(kept.keys() - found)
+        stored = self.load([(name, number) for name in PLACE_ARRAYS for number in missing], keep=False)
+        for number in missing:
+            found[number] = self._chunk_points(number, stored["voxel", number], stored["centroid", number])
+            self.cache.put((self.name, "points", number), found[number])
+        return found
+
+    def _chunk_points(self, number: int, word: NDArray[np.uint32], centroid: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """World points (3, rows) of a chunk: the middle of the centroid's quantisation step.
+
+        Axes are apart, so that every step runs over one stretch of memory.
+        """
+        first, last = number * len(word), min((number + 1) * len(word), int(self.block_start[-1]))
+        low, high = np.searchsorted(self.block_start, [first, last - 1], side="right")  # the blocks it cuts or holds
+        counts = np.diff(np.clip(self.block_start[low - 1 : high + 1], first, last))
+        corners = self.block_index[low - 1 : high] * self.lattice.block_m + self.lattice.origin_m[:2]
+        word, centroid = word[: last - first], centroid[: last - first]
+        step_m = self.lattice.voxel_m / CENTROID_STEPS
+        points = np.empty((3, last - first))
+        for axis, voxel in enumerate([word >> 24, word >> 16 & 0xFF, word & 0xFFFF]):
+            np.multiply(voxel * np.uint32(CENTROID_STEPS) + centroid[:, axis], step_m, out=points[axis])
+        points[:2] += np.repeat(corners + step_m / 2, counts, axis=0).T
+        points[2] += self.lattice.origin_m[2] - HEIGHT_OFFSET * self.lattice.voxel_m + step_m / 2
+        return points
 
     def _seen_by_others(self, rows: NDArray[np.int64], without_drives: Collection[str]) -> NDArray[np.bool_]:
         count = len(self.drives)
@@ -211,11 +253,20 @@ def stored_arrays(
     return arrays
 
 
-def _chunk_edges(rows: NDArray[np.int64], chunk_rows: int) -> list[tuple[int, int, int]]:
-    """Of each chunk that holds any of the ascending rows: its number, and which of the rows it holds, first to last."""
+class _Piece(NamedTuple):
+    """The wanted rows that lie in one chunk."""
+
+    chunk: int
+    rows: NDArray[np.int64]  # counted from the chunk's first one
+    first: int  # and their places among all wanted rows
+    last: int
+
+
+def _pieces(rows: NDArray[np.int64], chunk_rows: int) -> list[_Piece]:
+    """Ascending rows, by the chunk that holds them."""
     if not len(rows):
         return []
-    numbers = np.arange(rows[0] // chunk_rows, rows[-1] // chunk_rows + 1)
-    edges = np.searchsorted(rows, np.append(numbers, numbers[-1] + 1) * chunk_rows)
-    used = np.flatnonzero(edges[1:] > edges[:-1])
-    return list(zip(numbers[used].tolist(), edges[used].tolist(), edges[used + 1].tolist(), strict=True))
+    chunks = np.arange(rows[0] // chunk_rows, rows[-1] // chunk_rows + 1)
+    edges = np.searchsorted(rows, np.append(chunks, chunks[-1] + 1) * chunk_rows).tolist()
+    spans = zip(chunks.tolist(), edges[:-1], edges[1:], strict=True)
+    return [_Piece(c, rows[first:last] - c * chunk_rows, first, last) for c, first, last in spans if last > first]

@@ -1,6 +1,7 @@
 """A box around a vehicle: which blocks, columns and voxels of the city fall inside it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,7 +57,7 @@ class WindowBox:
                 raise InputError(f"{name} = ({low}, {high}) is empty; give the lower end first")
         return WindowBox(pose, x_m, y_m, z_m)
 
-    @property
+    @cached_property
     def corners_world(self) -> NDArray[np.float64]:
         """The eight corners (8, 3), world metres."""
         corners_ego = np.stack(np.meshgrid(self.x_m, self.y_m, self.z_m), -1).reshape(8, 3)
@@ -72,7 +73,7 @@ class WindowBox:
         least, greatest = self.block_range(lattice)
         axes = [np.arange(low, high + 1) for low, high in zip(least, greatest, strict=True)]
         blocks = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2).astype(np.int32)
-        return blocks[self.meets(blocks, lattice)]
+        return blocks[self._near(blocks, lattice)]
 
     def meets(self, blocks: NDArray[np.int32], lattice: Lattice) -> NDArray[np.bool_]:
         """Which blocks (N, 2) may hold voxels of the box; exact for a level vehicle.
@@ -81,12 +82,18 @@ class WindowBox:
         """
         least, greatest = self.block_range(lattice)
         near = np.all((blocks >= least) & (blocks <= greatest), -1)
+        near[near] = self._near(blocks[near], lattice)
+        return near
+
+    def _near(self, blocks: NDArray[np.int32], lattice: Lattice) -> NDArray[np.bool_]:
+        """Which blocks (N, 2) no line along or across the heading parts from the box."""
         forward = self.world_from_ego[:2, 0] / np.linalg.norm(self.world_from_ego[:2, 0])
-        axes = np.stack([forward, [-forward[1], forward[0]]], -1)
+        axes = np.array([[forward[0], -forward[1]], [forward[1], forward[0]]])
         reach = lattice.block_m / 2 * np.abs(axes).sum(0)  # of a block, along each axis
         corners = self.corners_world[:, :2] @ axes
+        low, high = corners.min(0) - reach, corners.max(0) + reach
         centres = lattice.block_centre(blocks) @ axes
-        return near & np.all((centres + reach >= corners.min(0)) & (centres - reach <= corners.max(0)), -1)
+        return np.all((centres >= low) & (centres <= high), -1)
 
     def inside(self, points_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """World points (N, 3) in the ego frame, and which of them lie in the box."""
@@ -109,7 +116,7 @@ class WindowBox:
             parts = []
             for side in range(2):
                 centres = (origin[side] + np.arange(shape[side]) + 0.5) * lattice.voxel_m + lattice.origin_m[side]
-                parts.append((centres - self.world_from_ego[side, 3]) * slope[side])
+                parts.append(((centres - self.world_from_ego[side, 3]) * slope[side]).astype(np.float32))
             values = parts[0][:, None] + parts[1]
             inside &= (values >= low) & (values < high)
         return inside

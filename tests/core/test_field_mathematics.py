@@ -6,8 +6,10 @@ import torch
 from presight_core.config import TrainingSettings
 from presight_core.field import losses, rendering, samplers, schedule
 from presight_core.field.assignment import Assignment, assign
-from presight_core.field.contraction import contract, grid_position
+from presight_core.field.contraction import contract, grid_position, grid_positions
+from presight_core.field.early_stop import weights_until
 from presight_core.field.mlp import SubFieldMlp
+from presight_core.field.rays import Rays
 from presight_core.field.spherical_harmonics import spherical_harmonics
 
 
@@ -120,7 +122,7 @@ def test_the_ground_loss_is_the_missing_weight_beyond_the_start_of_the_ground():
     weights = torch.tensor([[0.25, 0.5, 0.0], [0.0, 0.0, 0.0]])
     middles_m = torch.tensor([[1.0, 2.0, 3.0]]).expand(2, 3)
     loss = losses.ground_loss(weights, middles_m, torch.tensor([1.5, 0.0]))
-    assert loss.item() == pytest.approx(-math.log(0.5) / 2)  # the second ray knows of no ground
+    assert loss.item() == pytest.approx(-math.log((0.5 + 0.1) / 1.1) / 2)  # the second ray knows of no ground
 
 
 def test_distortion_equals_the_sum_over_all_pairs():
@@ -157,6 +159,14 @@ def test_sky_loss_is_small_when_only_the_sky_is_empty():
     is_sky = torch.tensor([True, False])
     right, wrong = torch.tensor([0.01, 0.99]), torch.tensor([0.99, 0.01])
     assert losses.sky_loss(right, is_sky) < 0.02 < losses.sky_loss(wrong, is_sky)
+
+
+def test_sky_loss_passes_over_rays_without_a_label():
+    accumulation, is_sky = torch.rand(6), torch.tensor([True, False, True, False, True, False])
+    is_known = torch.tensor([True, True, False, False, True, False])
+    expected = losses.sky_loss(accumulation[is_known], is_sky[is_known])
+    torch.testing.assert_close(losses.sky_loss(accumulation, is_sky, is_known), expected)
+    assert losses.sky_loss(accumulation, is_sky, torch.zeros(6, dtype=torch.bool)) == 0
 
 
 def test_learning_rate_rises_then_drops():
@@ -275,3 +285,33 @@ def test_each_sub_field_has_its_own_network():
     assert torch.equal(outputs[0], outputs[1])
     assert torch.equal(outputs[2], outputs[4])
     assert not torch.equal(outputs[0], outputs[2])
+
+
+def test_positions_in_one_pass_equal_those_of_each_sub_field():
+    points = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)) * torch.logspace(-2, 12, 200)[:, None]
+    centres, half_sizes = torch.tensor([[0.0, 1, 2], [-3, 0, 0]]), torch.tensor([[1.0, 2, 3], [4, 1, 1]])
+    positions, inside = grid_positions(points, torch.tensor([0, 90, 200]), centres, half_sizes)
+    parts = [
+        grid_position(points[rows], centres[sub_field], half_sizes[sub_field])
+        for sub_field, rows in enumerate((slice(0, 90), slice(90, 200)))
+    ]
+    torch.testing.assert_close(positions, torch.cat([part[0] for part in parts]), atol=1e-7, rtol=0)
+    assert torch.equal(inside, torch.cat([part[1] for part in parts]))
+    assert set(inside.tolist()) == {True, False}
+
+
+def test_following_rays_to_their_end_gives_the_weights_of_all_samples_in_front():
+    edges = torch.linspace(0, 10, 41).expand(3, -1)
+    rays = Rays(torch.zeros(3, 3), torch.eye(3))
+    looked_at = []
+
+    def density_at(points: torch.Tensor) -> torch.Tensor:
+        looked_at.append(points.shape[:2].numel())
+        return torch.where(points[..., 0] > 3, 20.0, 0.01)  # a wall across the first ray alone
+
+    found = weights_until(density_at, rays, edges, left=1e-3)
+    looked_at_early = sum(looked_at)
+    plain = rendering.ray_weights(density_at(rays.points(edges)), edges.diff(dim=-1))
+    torch.testing.assert_close(found, plain, atol=1e-3, rtol=0)
+    assert looked_at_early < 3 * 40
+    assert not found[0, 20:].any()

@@ -2,11 +2,12 @@ import json
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 from presight_core.config import FieldSettings, GridSettings, SamplingSettings
 from presight_core.errors import InputError, NotFoundError
-from presight_core.field.checkpoint import FIELD_FILE, load_field, save_field
+from presight_core.field.checkpoint import FIELD_FILE, load_field, load_tensors, save_field, save_tensors
 from presight_core.field.surface import find_surface
 from presight_core.field.tile_field import FieldShape, Sampling, TileField
 from presight_core.tiles import SubField
@@ -83,11 +84,24 @@ def test_every_parameter_learns():
     origins, directions = random_rays(64)
     numbers = np.arange(64)
     rays = field.rays(origins, directions, numbers % 3, numbers % 4)
-    seen = field(rays, Sampling(torch.Generator().manual_seed(0), 1.0, train_proposals=True))
+    seen = field(rays, Sampling(torch.rand(64, 3), 1.0, train_proposals=True))
     loss = seen.rgb.sum() + seen.features.sum() + sum(proposal.weights.square().sum() for proposal in seen.proposals)
     loss.backward()
     idle = [name for name, parameter in field.named_parameters() if parameter.grad is None or not parameter.grad.any()]
     assert idle == []
+
+
+def test_copies_of_tables_are_read_and_follow_the_tables():
+    field, rays = small_field(), random_rays(5)
+    exact = field(field.rays(*rays)).rgb
+    field.use_copies(torch.bfloat16)
+    torch.testing.assert_close(field(field.rays(*rays)).rgb, exact, atol=1e-3, rtol=0)
+    with torch.no_grad():
+        field.trunk.grid.table.normal_()
+    torch.testing.assert_close(field(field.rays(*rays)).rgb, exact, atol=1e-3, rtol=0)
+    field.refresh_copies()
+    assert float((field(field.rays(*rays)).rgb - exact).detach().abs().max()) > 0.003
+    assert not any("copy" in name for name in field.state_dict())
 
 
 def test_sky_features_ignore_the_video():
@@ -113,7 +127,7 @@ def test_evaluation_is_repeatable_and_training_is_jittered():
     field = small_field()
     rays = field.rays(*random_rays(3))
     assert torch.equal(field(rays).edges_m, field(rays).edges_m)
-    assert not torch.equal(field(rays).edges_m, field(rays, Sampling(torch.Generator())).edges_m)
+    assert not torch.equal(field(rays).edges_m, field(rays, Sampling(torch.rand(3, 3))).edges_m)
 
 
 def test_a_saved_field_renders_the_same(tmp_path):
@@ -170,3 +184,12 @@ def test_no_rays_have_no_surface():
     seen = find_surface(small_field(), np.zeros((0, 3)), np.zeros((0, 3)), "first-hit")
     assert seen.features.shape == (0, 5)
     assert seen.points_world.shape == (0, 3)
+
+
+def test_a_saved_file_is_one_that_safetensors_reads(tmp_path):
+    tensors = {"a": torch.arange(6).view(2, 3), "b": torch.rand(3, 2).T, "step": torch.tensor(2.0)}
+    save_tensors(tmp_path / "state", tensors, {"step": 2})
+    found = safetensors.torch.load_file(tmp_path / "state")
+    assert set(found) == set(tensors)
+    assert all(torch.equal(found[name], tensors[name]) for name in tensors)
+    assert load_tensors(tmp_path / "state")[1] == {"step": 2}

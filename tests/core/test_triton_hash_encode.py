@@ -5,7 +5,7 @@ import pytest
 
 from tests.core.without_card import compile_for_hopper, interpreted
 
-pytest.importorskip("triton")
+pytest.importorskip("triton", minversion="3.9")
 pytestmark = pytest.mark.slow
 
 TOLERANCES = {
@@ -27,7 +27,7 @@ TOLERANCES = {
 
 @pytest.fixture(scope="module")
 def errors() -> dict[str, float]:
-    return interpreted("hash")
+    return interpreted("tests.core.triton_interpreted", "hash")
 
 
 @pytest.mark.parametrize("case", TOLERANCES)

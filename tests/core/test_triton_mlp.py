@@ -4,7 +4,7 @@ import pytest
 
 from tests.core.without_card import compile_for_hopper, interpreted
 
-pytest.importorskip("triton")
+pytest.importorskip("triton", minversion="3.9")
 pytestmark = pytest.mark.slow
 
 SHARED_BYTES = 227 * 1024  # of one block of threads on a card of compute capability 9.0
@@ -12,7 +12,7 @@ PAPER = {"proposal": (8, 64, 1), "trunk": (40, 64, 80), "colour": (47, 64, 64, 3
 
 
 def test_networks_agree_with_a_loop_of_linear_layers_under_the_interpreter():
-    errors = interpreted("mlp")
+    errors = interpreted("tests.core.triton_interpreted", "mlp")
     assert len(errors) == 8
     for case, error in errors.items():
         # float16 has 11 bits, and a hidden value near zero may be rounded to either side of it.

@@ -5,6 +5,7 @@
 
 import json
 import sys
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -88,7 +89,7 @@ def mlp_cases() -> dict[str, float]:
         assignment = Assignment(torch.tensor([0, 70, 70, 1200]))  # the last one needs two programs on the way back
         inputs = torch.randn(1200, widths[0], requires_grad=True)
         output = network(inputs, assignment)
-        plain = network._one_by_one(inputs, assignment.bounds)
+        plain = network.blockwise(inputs, assignment.bounds)
         upstream = torch.randn_like(output)
         wanted = (inputs, *network.parameters())
         found, expected = (torch.autograd.grad(values, wanted, upstream) for values in (output, plain))
@@ -98,7 +99,7 @@ def mlp_cases() -> dict[str, float]:
     return errors
 
 
-PARTS = {"hash": hash_cases, "mlp": mlp_cases}
+PARTS: dict[str, Callable[[], dict[str, float]]] = {"hash": hash_cases, "mlp": mlp_cases}
 
 if __name__ == "__main__":
     torch.manual_seed(0)

@@ -5,14 +5,15 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[2]
 
 
-def interpreted(part: str) -> dict[str, float]:
-    """What `tests.core.triton_interpreted` prints for a part: the error of each case."""
-    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "tests.core.triton_interpreted", part]
+def interpreted(module: str, argument: object, interpret: bool = True) -> dict[str, Any]:
+    """The JSON that a module of the tests prints in a process of its own, where kernels are interpreted."""
+    environment = os.environ | {"TRITON_INTERPRET": str(int(interpret)), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", module, str(argument)]
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout)

@@ -5,6 +5,7 @@ import pytest
 
 from flows.drives import find_drive, remove_drive
 from flows.plan import plan_city
+from flows.publication import roll_back
 from flows.reconcile import hold_city
 from presight_core.config import load_city_settings
 from presight_core.errors import InputError, NotFoundError
@@ -47,6 +48,13 @@ def test_a_removed_drive_is_gone_from_bits_and_names_of_the_next_generation(city
     assert city.build() == 2
     kept = drive_id(city, "scene-0000")
     assert shown_drives(city) == ({kept}, {kept: "scene-0000"})
+
+
+def test_a_rollback_does_not_bring_a_removed_drive_back(city):
+    assert roll_back(city.root, CITY, 1) == 2
+    remove_drive(city.workspace, "scene-0001")
+    with pytest.raises(InputError, match="generation 1 may not be shown again: drive scene-0001 was removed"):
+        roll_back(city.root, CITY, 1)
 
 
 def test_a_tile_that_cannot_be_built_without_a_removed_drive_is_withdrawn(city):

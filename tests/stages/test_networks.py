@@ -1,5 +1,7 @@
 """Networks: what ONNX Runtime may run, and that it runs what the card says."""
 
+import hashlib
+
 import numpy as np
 import onnx
 import pytest
@@ -76,6 +78,35 @@ def test_weights_of_a_sub_graph_in_another_file_are_refused(write_model):
     inner.initializer.add(name="hidden", data_location=onnx.TensorProto.EXTERNAL)
     model.graph.node.add(op_type="If").attribute.add(name="then_branch", type=onnx.AttributeProto.GRAPH, g=inner)
     with pytest.raises(InputError, match="'hidden' is kept in another file"):
+        Network(card_at(write_model(content=model.SerializeToString())))
+
+
+def test_weights_in_a_file_that_the_card_lists_are_read(write_model, tmp_path):
+    model = onnx.load(card_at(write_model()).file)
+    expected = Network(card_at(write_model())).run([IMAGE])
+    onnx.save(model, tmp_path / "split.onnx", save_as_external_data=True, location="weights.bin", size_threshold=0)
+    digest = hashlib.sha256((tmp_path / "weights.bin").read_bytes()).hexdigest()
+    path = write_model(content=(tmp_path / "split.onnx").read_bytes())
+    path.write_text(path.read_text() + f'\nexternal_data = {{"weights.bin" = "{digest}"}}\n')
+    np.testing.assert_array_equal(Network(card_at(path)).run([IMAGE]), expected)
+    (tmp_path / "weights.bin").write_bytes(bytes(len((tmp_path / "weights.bin").read_bytes())))
+    with pytest.raises(InputError, match=r"weights\.bin: SHA-256 is"):
+        card_at(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"op_type": "Loop"}, "Loop"),
+        ({"op_type": "RandomUniform"}, "RandomUniform"),
+        ({"domain": "evil"}, "evil.Identity"),
+    ],
+)
+def test_operators_that_could_do_anything_are_refused(write_model, change, name):
+    model = onnx.load(card_at(write_model()).file)
+    for field, value in change.items():
+        setattr(model.graph.node[-1], field, value)
+    with pytest.raises(InputError, match=f"operator {name} is refused"):
         Network(card_at(write_model(content=model.SerializeToString())))
 
 

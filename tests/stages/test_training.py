@@ -3,7 +3,6 @@ import pytest
 import torch
 
 from presight_core import classes
-from presight_core.config import CitySettings, load_city_settings
 from presight_core.drives import FrameTable
 from presight_core.errors import BuildError, InputError
 from presight_core.field.checkpoint import load_field
@@ -11,18 +10,14 @@ from presight_core.frames import planar_transform
 from presight_core.pixels import FramePixels
 from presight_core.progress import Progress
 from presight_core.tiles import SubField
-from stages import training
+from stages import feeding
 from stages.evaluation import evaluate_tile
 from stages.ray_pool import RayPool, draw_static
 from stages.training import TileTraining, holdout_mask, image_numbers, train_tile, training_rows
+from tests.stages.small_training import tiny_settings
 
 EGO_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
 SIZE = (24, 16)
-TINY = (
-    "training.steps=12", "training.batch_rays=64", "training.checkpoint_every=6", "training.holdout_every=4",
-    "field.hidden_width=8", "field.proposal_width=8", "field.grid.log2_rows=8", "field.grid.max_resolution=64",
-    "field.grid.levels=3", "sampling.proposal_samples=[12, 8]", "sampling.field_samples=8",
-)  # fmt: skip
 
 
 class Gradient:
@@ -57,10 +52,6 @@ def street(count: int = 8, drives: int = 1) -> FrameTable:
     )
 
 
-def tiny_settings(*overrides: str) -> CitySettings:
-    return load_city_settings(None, ["preset=demo", *TINY, *overrides])
-
-
 def tiny_job(*overrides: str, frames: FrameTable | None = None) -> TileTraining:
     halves = (
         SubField((2.5, 0, 1.5), (-15, -15, -4), (20, 15, 16)),
@@ -79,7 +70,7 @@ def test_training_lowers_the_loss(tmp_path):
     train_tile(tiny_job(*overrides), Gradient(), tmp_path, seen.append)
     assert seen[-1].done == seen[-1].total == 60
     assert seen[-1].figures["loss"] < seen[1].figures["loss"] / 2  # the first report says only that it begins
-    assert set(seen[-1].figures) == {"loss", "psnr_db", "rays_per_s"}
+    assert set(seen[-1].figures) == {"loss", "psnr_db", "rays_per_s", "waiting_share"}
 
 
 def test_an_interrupted_training_ends_as_an_uninterrupted_one(tmp_path):
@@ -211,8 +202,8 @@ def test_pools_that_do_not_fit_take_turns(tmp_path, monkeypatch):
             loaded.append(row)
             return super().load(row)
 
-    monkeypatch.setattr(training, "POOL_BYTES", 3 * 1500)  # an image is about 1300 bytes
-    monkeypatch.setattr(training, "POOL_STEPS", 4)
+    monkeypatch.setattr(feeding, "POOL_BYTES", 3 * 1500)  # an image is about 1300 bytes
+    monkeypatch.setattr(feeding, "POOL_STEPS", 4)
     train_tile(tiny_job(), Counting(), tmp_path)
     assert len(loaded) == 1 + 3 * 3  # one to know the size, then three images for each of three pools
     assert set(loaded).isdisjoint({2, 6})  # held out
@@ -231,3 +222,36 @@ def test_evaluation_without_held_out_frames_is_empty(tmp_path):
     job = tiny_job("training.holdout_every=0", "training.steps=1")
     field = load_field(train_tile(job, Gradient(), tmp_path).folder)
     assert evaluate_tile(job, field, Gradient(), tmp_path / "pictures") == {}
+
+
+def test_an_image_that_cannot_be_read_stops_the_training(tmp_path, monkeypatch):
+    class Broken(Gradient):
+        def load(self, row: int) -> FramePixels:
+            if row == 5:
+                raise InputError("5.jpg: broken; copy it again")
+            return super().load(row)
+
+    monkeypatch.setattr(feeding, "POOL_BYTES", 3 * 1500)  # an image is about 1300 bytes
+    monkeypatch.setattr(feeding, "POOL_STEPS", 2)  # so that it is not in the first pool, but in one of them
+    with pytest.raises(InputError, match=r"5\.jpg"):
+        train_tile(tiny_job(), Broken(), tmp_path)
+
+
+def test_images_larger_than_the_first_fit_into_a_pool():
+    class Growing(Gradient):
+        def load(self, row: int) -> FramePixels:
+            pixels = super().load(row)
+            return FramePixels(np.repeat(pixels.rgb, row + 1, 0), pixels.labels, pixels.features)
+
+    pool = RayPool(street(), Growing(), np.array([0, 2, 3]))
+    assert [pool.size_px(image) for image in range(3)] == [(24, 16), (24, 48), (24, 64)]
+    batch = pool.at(np.array([0, 1, 2]), np.array([[0, 15], [0, 47], [23, 63]]))
+    assert batch.rgb[:, 0].tolist() == [70, 72, 73]  # the lowest rows: road
+
+
+def test_the_next_batch_is_the_same_whether_drawn_ahead_or_not():
+    job = tiny_job()
+    rows = training_rows(job.frames, job.settings.training)
+    with feeding.Feed(job, Gradient(), rows) as one, feeding.Feed(job, Gradient(), rows) as other:
+        ahead = [one.batch(step) for step in (3, 4, 5)][-1]
+        np.testing.assert_array_equal(other.batch(5).directions_world, ahead.directions_world)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from presight_core.drives import FrameTable, Reject
-from presight_core.errors import InputError, NotFoundError, StoreError
+from presight_core.errors import ConflictError, InputError, NotFoundError, StoreError
 from presight_core.pixels import FrameLayers
 from storage.features import FeatureCache
 
@@ -37,7 +37,7 @@ def layers(seed: int, label_shape: tuple[int, int] = (32, 48)) -> FrameLayers:
 
 
 FRAMES = frames_of(["a.jpg", "b.jpg", "c.jpg"])
-ITEMS = [(0, layers(0)), REJECT, (2, layers(2, (16, 24)))]
+ITEMS = [(0, layers(0)), (1, REJECT), (2, layers(2, (16, 24)))]
 
 
 @pytest.fixture
@@ -82,14 +82,87 @@ def test_a_drive_is_complete_only_when_all_of_it_is_there(tmp_path):
     with pytest.raises(InputError, match="gone"):
         cache.write("key", "d0", FRAMES, breaking())
     assert not cache.is_complete("key", "d0")
-    assert list((tmp_path / "key").iterdir()) == []
 
 
-def test_too_few_items_are_our_own_mistake_and_leave_nothing(tmp_path):
+def test_an_interrupted_write_goes_on_behind_its_last_image(tmp_path):
+    cache = FeatureCache(tmp_path)
+
+    def breaking():
+        yield from ITEMS[:2]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cache.write("key", "d0", FRAMES, breaking())
+    assert FeatureCache(tmp_path).missing_rows("key", "d0", 3).tolist() == [2]
+    assert FeatureCache(tmp_path).write("key", "d0", FRAMES, ITEMS[2:]) == (REJECT,)
+    for row, written in (ITEMS[0], ITEMS[2]):
+        np.testing.assert_array_equal(cache.read("key", "d0", row).features, written.features)
+
+
+def test_a_line_that_a_kill_cut_short_does_not_count(tmp_path):
+    cache = FeatureCache(tmp_path)
+    with pytest.raises(AssertionError):
+        cache.write("key", "d0", FRAMES, ITEMS[:2])
+    lines = tmp_path / "key" / ".d0.jsonl"
+    lines.write_bytes(lines.read_bytes()[:-5])
+    assert cache.missing_rows("key", "d0", 3).tolist() == [1, 2]
+    assert cache.write("key", "d0", FRAMES, ITEMS[1:]) == (REJECT,)
+
+
+def test_a_damaged_line_is_damage(tmp_path):
+    cache = FeatureCache(tmp_path)
+    with pytest.raises(AssertionError):
+        cache.write("key", "d0", FRAMES, ITEMS[:2])
+    lines = tmp_path / "key" / ".d0.jsonl"
+    lines.write_bytes(b"?" + lines.read_bytes())
+    with pytest.raises(StoreError, match="a line cannot be read"):
+        cache.missing_rows("key", "d0", 3)
+
+
+def test_two_writers_of_one_drive_do_not_meet(tmp_path):
+    cache = FeatureCache(tmp_path)
+
+    def meeting():
+        with pytest.raises(ConflictError, match="another process"):
+            cache.write("key", "d0", FRAMES, ITEMS)
+        yield from ITEMS
+
+    cache.write("key", "d0", FRAMES, meeting())
+    assert cache.is_complete("key", "d0")
+
+
+def test_too_few_items_are_our_own_mistake(tmp_path):
     cache = FeatureCache(tmp_path)
     with pytest.raises(AssertionError, match="2 items for 3 frames"):
         cache.write("key", "d0", FRAMES, ITEMS[:2])
     assert not cache.is_complete("key", "d0")
+
+
+def test_compact_features_come_back_about_as_they_were(tmp_path):
+    cache = FeatureCache(tmp_path)
+    features = smooth_features()
+    cache.write("key", "d0", frames_of(["a.jpg"]), [(0, FrameLayers(np.zeros((4, 4), np.uint8), features))], np.ones(5))
+    read = FeatureCache(tmp_path).read("key", "d0", 0).features
+    assert 0 < np.abs(read.astype(int) - features).mean() < 4
+    assert cache.figures("key", "d0")["feature_bytes"] < features.size / 4
+
+
+def smooth_features() -> np.ndarray:
+    row, column, channel = np.meshgrid(np.arange(16), np.arange(24), np.arange(5), indexing="ij")
+    return (128 + 100 * np.sin(row / 5 + channel) * np.cos(column / 7)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("place", [0, 30])
+def test_a_flipped_bit_in_compact_features_is_damage(tmp_path, place):
+    cache = FeatureCache(tmp_path)
+    layers_ = FrameLayers(np.zeros((4, 4), np.uint8), smooth_features())
+    cache.write("key", "d0", frames_of(["a.jpg"]), [(0, layers_)], np.ones(5))
+    (chunk,) = (file for file in (tmp_path / "key" / "d0" / "features" / "c").rglob("*") if file.is_file())
+    content = bytearray(chunk.read_bytes())
+    content[place] ^= 1
+    chunk.write_bytes(content)
+    with pytest.raises(StoreError, match="delete this, and the next build"):
+        cache.read("key", "d0", 0)
 
 
 def test_a_second_write_keeps_the_first(cache):
@@ -117,7 +190,7 @@ def test_a_flipped_bit_is_damage(cache, tmp_path, array):
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
-    with pytest.raises(StoreError, match="delete this folder"):
+    with pytest.raises(StoreError, match="delete this, and the next build"):
         cache.read("key", "d0", 0)
 
 

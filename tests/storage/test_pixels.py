@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from presight_core.config import CitySettings, TrainingSettings
 from presight_core.drives import FrameTable
 from presight_core.errors import InputError, NotFoundError
 from presight_core.pixels import FrameLayers
@@ -46,7 +47,8 @@ def cache(tmp_path, frames) -> FeatureCache:
 
 
 def pixels_of(frames: FrameTable, root: Path, cache: FeatureCache, scale: float = 1.0) -> CachedPixels:
-    return CachedPixels(frames, {"d0": root}, cache, "key", scale)
+    settings = CitySettings(training=TrainingSettings(image_scale=scale))
+    return CachedPixels(frames, {"d0": root}, cache, "key", settings)
 
 
 def test_a_choice_of_frames_keeps_each_frames_own_layers(frames, cache, tmp_path):

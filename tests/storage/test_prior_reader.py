@@ -192,7 +192,7 @@ def test_batched_windows_of_a_remote_store_are_fetched_together(town, monkeypatc
     )
     reader = town.reader()
     windows = reader.windows(list(POSES.values()), **RANGES)
-    assert [size for size in batches if size] == [1, 1, 1, 6]  # three block tables, then all voxel arrays at once
+    assert [size for size in batches if size] == [1, 1, 1, 2, 4]  # three block tables, then places, then looks
     monkeypatch.undo()
     for window, pose in zip(windows, POSES.values(), strict=True):
         np.testing.assert_array_equal(window.hits, town.reader().window(pose, **RANGES).hits)
@@ -358,3 +358,48 @@ def test_a_remote_store_in_a_forked_process_is_refused_and_does_not_hang(monkeyp
 def test_an_unknown_kind_of_url_is_a_store_error():
     with pytest.raises(StoreError, match="nonsense"):
         PriorReader.open("nonsense://place", "town")
+
+
+def hits_of(reader: PriorReader) -> int:
+    return int(reader.window(POSES["level"]).hits.sum())
+
+
+def test_a_reader_works_in_a_spawned_process(town):
+    reader = town.reader()
+    expected = hits_of(reader)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.map(hits_of, [reader, reader]) == [expected, expected]
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - a Path would open it once more
+
+
+def many_windows_leak_nothing(empty_town, monkeypatch, count: int) -> None:
+    monkeypatch.setattr(schema, "CHUNK_ROWS", 128)
+    publish_first(empty_town)
+    reader = PriorReader.open(empty_town.location, "town", cache_bytes=6_000)  # a chunk or two: most are read anew
+    random = np.random.default_rng(0)
+    reader.window(POSES["level"])
+    before = open_files()
+    most_memory = 0
+    for number in range(count):
+        pose = frames.planar_transform(*random.uniform(-40, 40, 2), random.uniform(0, 7))
+        reader.window(pose, (-3.0, 3.0), (-3.0, 3.0))
+        if number == count // 10:
+            most_memory = resident_bytes()
+    assert open_files() == before
+    assert resident_bytes() < most_memory + 2e6 + 40 * count  # a window holds more than 2 kB, a chunk 1 kB
+
+
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_a_thousand_windows_leak_neither_files_nor_memory(empty_town, monkeypatch):
+    many_windows_leak_nothing(empty_town, monkeypatch, 1_000)
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_windows_leak_neither_files_nor_memory(empty_town, monkeypatch):
+    many_windows_leak_nothing(empty_town, monkeypatch, 100_000)

@@ -52,10 +52,11 @@ def encode(
     source, features = table if copy is None else copy, table.shape[1]
     launch = launch or default_launch(features)
     output = source.new_empty(len(points), len(levels) * features)
-    _encode[launch.grid(len(points), len(levels))](
-        points.contiguous(), segments, source, offsets, levels, output, len(points),
-        **_constants(offsets, levels, features, launch),
-    )  # fmt: skip
+    with torch.cuda.device_of(points):  # Triton launches on the present device
+        _encode[launch.grid(len(points), len(levels))](
+            points.contiguous(), segments, source, offsets, levels, output, len(points),
+            **_constants(offsets, levels, features, launch),
+        )  # fmt: skip
     return output
 
 
@@ -72,10 +73,11 @@ def table_gradient(
     features = gradient.shape[1] // len(levels)
     launch = launch or default_launch(features)
     result = torch.zeros(row_count, features, dtype=torch.float32, device=gradient.device)
-    _table_gradient[launch.grid(len(points), len(levels))](
-        points.contiguous(), segments, gradient.contiguous(), offsets, levels, result, len(points),
-        **_constants(offsets, levels, features, launch),
-    )  # fmt: skip
+    with torch.cuda.device_of(points):  # Triton launches on the present device
+        _table_gradient[launch.grid(len(points), len(levels))](
+            points.contiguous(), segments, gradient.contiguous(), offsets, levels, result, len(points),
+            **_constants(offsets, levels, features, launch),
+        )  # fmt: skip
     return result
 
 
@@ -92,10 +94,11 @@ def point_gradient(
     features = table.shape[1]
     launch = launch or Launch(points=128, levels=len(levels))  # one program adds up all levels of its points
     result = torch.empty_like(points, memory_format=torch.contiguous_format)
-    _point_gradient[launch.grid(len(points), launch.levels)](
-        points.contiguous(), segments, table, offsets, levels, gradient.contiguous(), result, len(points),
-        **_constants(offsets, levels, features, launch),
-    )  # fmt: skip
+    with torch.cuda.device_of(points):  # Triton launches on the present device
+        _point_gradient[launch.grid(len(points), launch.levels)](
+            points.contiguous(), segments, table, offsets, levels, gradient.contiguous(), result, len(points),
+            **_constants(offsets, levels, features, launch),
+        )  # fmt: skip
     return result
 
 
