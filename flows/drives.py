@@ -123,7 +123,7 @@ def show_removal(folder: Path, drive: str, wait: bool, as_json: bool) -> None:
 
 
 def _values(record: DriveRecord, split: SplitSettings) -> dict[str, Any]:
-    part = part_of(record.drive.name, split)
+    part = None if record.removed_at else part_of(record.drive.name, split)
     return {**asdict(record.drive), "part": part, "added_at": record.added_at, "removed_at": record.removed_at}
 
 
