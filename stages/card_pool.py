@@ -17,7 +17,7 @@ from presight_core import classes
 from presight_core.errors import InputError
 from presight_core.field.tile_field import Rays
 from presight_core.pixels import FramePixels, PixelSource
-from stages.ray_pool import THIN
+from stages.ray_pool import THIN, choose_images
 
 HOST_BYTES = 3 << 30  # of a pool where the device is no card
 CARD_SHARE = 0.25  # of the card's free memory; the rest is for activations
@@ -158,16 +158,9 @@ class CardPool:
         return max(1, int(room) // of_image)
 
     def _choose(self, epoch: int) -> NDArray[np.int64]:
-        """Frames of an epoch, as many of each sub-field as there is room for."""
-        if not self.changes:
-            return np.arange(len(self._frames.rows))
-        order = np.random.default_rng([self._choice.seed, epoch, 1]).permutation(len(self._frames.rows))
-        owner = self._frames.sub_fields[order]
-        by_owner = np.argsort(owner, kind="stable")
-        starts = np.searchsorted(owner[by_owner], owner[by_owner])
-        rank = np.empty(len(order), np.int64)  # how many of its sub-field come before each
-        rank[by_owner] = np.arange(len(order)) - starts
-        return np.sort(order[np.argsort(rank, kind="stable")[: self.capacity]])
+        return choose_images(
+            self._frames.sub_fields, self.capacity, np.random.default_rng([self._choice.seed, epoch, 1])
+        )
 
     def _load(self, epoch: int) -> list[Future[_Loaded]]:
         return [self._executor.submit(self._load_one, frame) for frame in self._choose(epoch).tolist()]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from presight_core.pixels import PixelSource
-from stages.ray_pool import PixelBatch, RayPool, bytes_of, draw_static
+from stages.ray_pool import PixelBatch, RayPool, bytes_of, choose_images, draw_static
 
 if TYPE_CHECKING:
     from stages.training import TileTraining
@@ -93,13 +93,6 @@ class _Pools:
         return RayPool(self._job.frames, self._source, self._rows[self._choose(epoch)], self._job.threads)
 
     def _choose(self, epoch: int) -> NDArray[np.int64]:
-        """Places in `rows` of the pool's images, as many of each sub-field as there is room for."""
-        if self._fits:
-            return np.arange(len(self._rows))
+        """Places in `rows` of the pool's images."""
         random = np.random.default_rng([self._job.settings.training.seed, epoch, 1])  # 1: apart from the steps'
-        order = random.permutation(len(self._rows))
-        rank = np.empty(len(order), np.int64)  # how many of its sub-field come before each
-        for sub_field in np.unique(self._sub_field):
-            places = np.flatnonzero(self._sub_field[order] == sub_field)
-            rank[places] = np.arange(len(places))
-        return np.sort(order[np.argsort(rank, kind="stable")[: self._capacity]])
+        return choose_images(self._sub_field, self._capacity, random)

@@ -135,6 +135,18 @@ def draw_static(
     )
 
 
+def choose_images(sub_fields: NDArray[np.int64], capacity: int, random: np.random.Generator) -> NDArray[np.int64]:
+    """At most `capacity` of the images whose sub-fields (N,) are given, ascending; as many of each as there is room."""
+    if len(sub_fields) <= capacity:
+        return np.arange(len(sub_fields))
+    order = random.permutation(len(sub_fields))
+    owner = sub_fields[order]
+    by_owner = np.argsort(owner, kind="stable")
+    rank = np.empty(len(order), np.int64)  # how many of its sub-field come before each
+    rank[by_owner] = np.arange(len(order)) - np.searchsorted(owner[by_owner], owner[by_owner])
+    return np.sort(order[np.argsort(rank, kind="stable")[:capacity]])
+
+
 def bytes_of(image: FramePixels) -> int:
     """Memory of one decoded image."""
     return image.rgb.nbytes + image.labels.nbytes + image.features.nbytes
