@@ -11,6 +11,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ class Child:
             if time.monotonic() > deadline:
                 os.kill(self.process, signal.SIGKILL)
                 os.waitpid(self.process, 0)
+                _running.discard(self.process)
                 raise AssertionError(f"a child hangs; {self.log.read_text()}")
             time.sleep(0.002)
         _running.discard(self.process)
@@ -66,16 +68,18 @@ def start(work: Callable[[Acknowledge], Any], log: Path, setting: str = "") -> C
     It ends with 0, with the exit code of an error of ours, or with 99 for any other error.
     """
     reading, writing = os.pipe()
+    errors = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)  # here, where no fault is injected
     sys.stdout.flush()
     sys.stderr.flush()
     process = os.fork()
     if process:
         os.close(writing)
+        os.close(errors)
         _running.add(process)
         return Child(process, reading, log)
     try:
         os.close(reading)
-        os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), 2)
+        os.dup2(errors, 2)
         sys.stdout = sys.stderr = io.StringIO()  # a terminal's faults are not what is tested
         failpoints.arm(setting)
         os._exit(_exit_code(lambda: work(lambda value: _say(writing, value))))
@@ -117,10 +121,11 @@ def result(work: Callable[[], Any], log: Path) -> Any:
 
 def end_all() -> None:
     """Kill the children that a failed test left behind, the stopped ones too."""
-    for process in _running:
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-    _running.clear()
+    while _running:
+        process = _running.pop()
+        with suppress(ProcessLookupError, ChildProcessError):  # its end was seen already
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
 
 
 def _say(pipe: int, value: Any) -> None:
