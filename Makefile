@@ -24,7 +24,7 @@ test: install
 
 # Faults by the thousand: hours. What `make test` injects is the short form of it.
 torture: install
-	PRESIGHT_TORTURE=1 $(BIN)/python -m pytest --timeout 0 tests/torture
+	PRESIGHT_TORTURE=1 $(BIN)/python -m pytest --timeout 0 tests/torture tests/storage/test_store_model.py
 
 check: lint
 	$(BIN)/python -m pytest -m "not slow"
