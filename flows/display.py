@@ -1,29 +1,21 @@
 """Progress bars of a running build, drawn from the catalog: what it says is what `presight status` says."""
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+from flows.background import beside
 from storage.catalog import Build, Catalog
 
 POLL_SECONDS = 0.5
 
 
-@contextmanager
-def watch_builds(catalog: Catalog, city: str) -> Iterator[None]:
+def watch_builds(catalog: Catalog, city: str) -> AbstractContextManager[None]:
     """Show the city's builds that start before the block ends."""
-    stop = threading.Event()
     known = {build.build_id for build in catalog.builds(city)}
-    thread = threading.Thread(target=_draw, args=(catalog, city, known, stop), daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    return beside(lambda stop: _draw(catalog, city, known, stop), f"progress of {city}")
 
 
 def _draw(catalog: Catalog, city: str, known: set[int], stop: threading.Event) -> None:

@@ -7,9 +7,10 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
+from flows.background import beside
 from flows.console import print_json
 from flows.jobs import recipe_from
 from presight_core.errors import ConflictError, PresightError, StoreError
@@ -132,12 +133,10 @@ def _take(workspace: Workspace, catalog: Catalog, city: str, wait: bool) -> Leas
             time.sleep(POLL_S)
 
 
-@contextmanager
-def _heartbeat(catalog: Catalog, lease: Lease, seconds: float) -> Iterator[None]:
+def _heartbeat(catalog: Catalog, lease: Lease, seconds: float) -> AbstractContextManager[None]:
     """Renew the lease in the background until the block ends."""
-    stop = threading.Event()
 
-    def beat() -> None:
+    def beat(stop: threading.Event) -> None:
         while not stop.wait(seconds / BEATS):
             try:
                 catalog.leases.renew(lease, seconds)
@@ -146,13 +145,7 @@ def _heartbeat(catalog: Catalog, lease: Lease, seconds: float) -> Iterator[None]
             except StoreError:
                 continue  # the catalog may be back before the lease is over
 
-    thread = threading.Thread(target=beat, daemon=True, name=f"heartbeat of {lease.city}")
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    return beside(beat, f"heartbeat of {lease.city}")
 
 
 def _is_shown(head: Generation | None, build: Build) -> bool:
