@@ -82,6 +82,14 @@ class Catalog:
             upgrade(database)
         return Catalog(database, clock)
 
+    @staticmethod
+    def unchecked(url: str, clock: Clock = utc_now) -> "Catalog":
+        """The catalog at a URL, unasked whether its schema is this version's: that takes a connection of its own.
+
+        For reading where time counts. What then raises StoreError may be cured by `open`.
+        """
+        return Catalog(open_database(url), clock)
+
     def now(self) -> str:
         """The time by the catalog's clock, as it is recorded."""
         return self._now()
