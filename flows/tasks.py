@@ -10,6 +10,7 @@ from prefect.cache_policies import NO_CACHE
 
 from flows.jobs import Job
 from flows.launch import WorkerLostError, run_job
+from flows.pace import Pace
 from presight_core.errors import BuildError, ConflictError
 from presight_core.progress import Progress
 
@@ -60,4 +61,4 @@ def _work(command: str, job: Job) -> dict[str, Any]:
         if not catalog.progress(job.build_id, progress):
             raise BuildError(f"{command}: somebody ended build {job.build_id} in the catalog; its work is given up")
 
-    return run_job(command, job, report)
+    return run_job(command, job, Pace(report))
