@@ -28,7 +28,7 @@ KUBERNETES = "1.37"  # the newest schemas of the validator
 TEXTS = [*(file for file in sorted(DEPLOY.rglob("*")) if file.is_file()), REPOSITORY / "docs/deploy.md"]
 COMMAND = re.compile(r"(?<=[\[`\s])presight (?:[a-z]|--)[^]`#|;&()\n]*")
 
-COMING = {"deploy", "serve-flows", "--runner"}  # commands and options that are written at the same time
+COMING = {"deploy", "serve-flows", "--runner"}  # not there yet; once one is there, it is checked as all others are
 
 
 def needed(name: str) -> None:
@@ -202,16 +202,18 @@ def _require_known(line: str) -> None:
     words = iter(shlex.split(line)[1:])
     for word in words:
         commands = getattr(command, "commands", None)
-        if word in COMING:
+        is_option = word.startswith("--")
+        known = {name for option in command.params for name in option.opts} if is_option else commands
+        if known is None:
+            continue  # an argument
+        name = word.partition("=")[0]
+        if name in COMING and name not in known:
             return
-        if word.startswith("--"):
-            known = {name for option in command.params for name in option.opts}
-            assert word.partition("=")[0] in known, f"{line}: {command.name} has no option {word}"
-            if commands:
-                next(words)  # a value: --workspace FOLDER
+        assert name in known, f"{line}: {command.name or 'presight'} has no {name}"
+        if not is_option:
+            command = known[word]
         elif commands:
-            assert word in commands, f"{line}: no command {word}"
-            command = commands[word]
+            next(words)  # a value: --workspace FOLDER
 
 
 def _manifests() -> list[dict[str, Any]]:
