@@ -1,26 +1,18 @@
 """`presight build`: plan, and run the flow only if something is stale."""
 
-import os
 import signal
 import sys
 import time
 from pathlib import Path
 from typing import Any, NoReturn
 
+from flows import prefect_settings
 from flows.console import print_json
 from flows.plan import CityPlan, plan_city
 from flows.reconcile import reconcile
 from presight_core.config import load_city_settings
 from presight_core.errors import BuildError
 from storage.workspace import Workspace
-
-# The embedded Prefect server needs 14-29 s on a cold start, more on a busy machine; it reports to nobody.
-PREFECT_ENVIRONMENT = {
-    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
-    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
-    "DO_NOT_TRACK": "1",
-    "PREFECT_LOGGING_LEVEL": "CRITICAL",
-}
 
 
 def build_city(
@@ -54,8 +46,7 @@ def build_city(
 def _run(
     workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None, wait: bool
 ) -> dict[str, Any]:
-    for name, value in PREFECT_ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
+    prefect_settings.prepare(log_level="CRITICAL")  # its word on a build is the catalog's, which we show
     from flows.city import run_city
     from flows.display import watch_builds
 

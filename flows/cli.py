@@ -6,7 +6,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from flows import store_commands
+from flows import schedule_commands, store_commands
 from flows.feature_commands import features
 from flows.model_commands import models
 from flows.options import AsJson, City, Overrides
@@ -224,6 +224,7 @@ def doctor(context: typer.Context, as_json: AsJson = False) -> None:
     show_findings(context.obj, as_json)
 
 
+app.add_typer(schedule_commands.app)
 app.add_typer(store_commands.app)
 
 
