@@ -1,9 +1,11 @@
-"""`presight build`: plan, and run the flow only if something is stale."""
+"""`presight build` and `presight update`: plan, and run the flow only if something is stale."""
 
 import os
 import signal
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -23,25 +25,36 @@ PREFECT_ENVIRONMENT = {
 }
 
 
-def build_city(
-    folder: Path, city: str, overrides: list[str], parallel: int | None, as_json: bool, wait: bool = False
-) -> None:
+@dataclass(frozen=True)
+class Request:
+    """What a user wants built."""
+
+    city: str
+    overrides: Sequence[str] = ()
+    parallel: int | None = None  # tiles at once
+    wait: bool = False
+    accept: Sequence[str] = ()
+    warm: bool = False  # `presight update`
+    as_json: bool = False
+
+
+def build_city(folder: Path, request: Request) -> None:
     """Build what is stale of a city and say what became of it.
 
     Raises BuildError if a tile failed, LeaseHeldError if another run builds the city and this one shall not wait.
     """
-    started = time.monotonic()
+    started, city = time.monotonic(), request.city
     workspace = Workspace.open(folder).require()
     reconcile(workspace, city)
-    plan = plan_city(workspace, city, load_city_settings(workspace.city_file(city), overrides))
+    plan = plan_city(workspace, city, load_city_settings(workspace.city_file(city), request.overrides))
     if not plan.is_current:
-        if not wait:
+        if not request.wait:
             workspace.catalog().leases.require_free(city)  # said now, not after the flow took its time to start
-        outcome = _run(workspace, plan, overrides, parallel, wait)
+        outcome = _run(workspace, plan, request)
     else:
         outcome = {"generation": plan.generation, "published": [], "failed": {}, "withdrawn": {}}
     outcome["seconds"] = round(time.monotonic() - started, 1)
-    if as_json:
+    if request.as_json:
         print_json(outcome)
     else:
         _print(city, outcome)
@@ -51,18 +64,24 @@ def build_city(
         )
 
 
-def _run(
-    workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None, wait: bool
-) -> dict[str, Any]:
+def _run(workspace: Workspace, plan: CityPlan, request: Request) -> dict[str, Any]:
     for name, value in PREFECT_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    from flows.city import run_city
+    from flows.city import Order, run_city
     from flows.display import watch_builds
 
     signal.signal(signal.SIGTERM, _exit)  # so that Prefect's embedded server ends with us
     print(f"{plan.city}: starting the flow", file=sys.stderr)
+    order = Order(
+        str(workspace.root),
+        plan.city,
+        request.overrides,
+        wait=request.wait,
+        accept=request.accept,
+        warm=request.warm,
+    )
     with watch_builds(workspace.catalog(), plan.city):
-        return run_city(workspace, plan, overrides, parallel, wait)
+        return run_city(order, len(plan.stale), request.parallel)
 
 
 def _exit(number: int, _frame: Any) -> NoReturn:

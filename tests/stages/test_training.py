@@ -11,7 +11,7 @@ from presight_core.pixels import FramePixels
 from presight_core.progress import Progress
 from presight_core.tiles import SubField
 from stages import feeding
-from stages.evaluation import evaluate_tile
+from stages.evaluation import Evaluation, evaluate_tile
 from stages.ray_pool import RayPool, draw_static
 from stages.training import TileTraining, holdout_mask, image_numbers, train_tile, training_rows
 from tests.stages.small_training import tiny_settings
@@ -212,16 +212,18 @@ def test_pools_that_do_not_fit_take_turns(tmp_path, monkeypatch):
 def test_evaluation_reports_the_held_out_frames_and_draws_them(tmp_path):
     job = tiny_job("training.steps=30")
     field = load_field(train_tile(job, Gradient(), tmp_path).folder)
-    figures = evaluate_tile(job, field, Gradient(), tmp_path / "pictures")
+    evaluation = evaluate_tile(job, field, Gradient(), tmp_path / "pictures")
+    figures = evaluation.metrics
     assert set(figures) == {"psnr_db", "psnr_own_video_db", "feature_rmse", "found_share", "sky_share"}
     assert figures["psnr_db"] > 10
+    assert evaluation.drive_psnr_db == {"drive0": pytest.approx(figures["psnr_db"])}
     assert (tmp_path / "pictures" / "rows.png").stat().st_size > 0
 
 
 def test_evaluation_without_held_out_frames_is_empty(tmp_path):
     job = tiny_job("training.holdout_every=0", "training.steps=1")
     field = load_field(train_tile(job, Gradient(), tmp_path).folder)
-    assert evaluate_tile(job, field, Gradient(), tmp_path / "pictures") == {}
+    assert evaluate_tile(job, field, Gradient(), tmp_path / "pictures") == Evaluation({}, {})
 
 
 def test_an_image_that_cannot_be_read_stops_the_training(tmp_path, monkeypatch):

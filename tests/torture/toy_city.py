@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from flows.city import freeze, tile_jobs
+from flows.acceptance import Built
+from flows.city import Order, freeze, tile_jobs
 from flows.ingest import ingest_root
 from flows.plan import plan_city, record_plan, space_key
-from flows.publication import Built, publish
+from flows.publication import publish
 from flows.reconcile import hold_city, reconcile
 from presight_core.config import load_city_settings
 from presight_core.feature_space import FeatureSpace
@@ -79,7 +80,8 @@ class ToyCity:
                 return plan.generation
             if plan.stale:
                 freeze(workspace, plan, lease)
-            built = [self._written(workspace, job) for job in tile_jobs(workspace, plan, 1, ["cpu"], lease).values()]
+            jobs = tile_jobs(workspace, plan, Order(str(self.root), CITY), lease)
+            built = [self._written(workspace, job) for job in jobs.values()]
             return publish(workspace, plan, built, {}, lease)["generation"]
 
     def example(self, tile_id: str) -> ExampleTile:
