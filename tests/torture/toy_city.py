@@ -68,8 +68,8 @@ class ToyCity:
         """Take in the drives."""
         ingest_root(self.root, self.data, VERSION, keep_going=False, as_json=False)
 
-    def build(self, wait: bool = False, overrides: tuple[str, ...] = ()) -> int | None:
-        """Build and publish what is stale, as the flow does; the generation."""
+    def build(self, wait: bool = False, overrides: tuple[str, ...] = (), warm: bool = False) -> int | None:
+        """Build and publish what is stale, as the flows do; the generation."""
         workspace = self.workspace
         settings = load_city_settings(workspace.city_file(CITY), overrides)
         reconcile(workspace, CITY)
@@ -80,7 +80,7 @@ class ToyCity:
                 return plan.generation
             if plan.stale:
                 freeze(workspace, plan, lease)
-            jobs = tile_jobs(workspace, plan, Order(str(self.root), CITY), lease)
+            jobs = tile_jobs(workspace, plan, Order(str(self.root), CITY, warm=warm), lease)
             built = [self._written(workspace, job) for job in jobs.values()]
             return publish(workspace, plan, built, {}, lease)["generation"]
 
