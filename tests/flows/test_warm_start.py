@@ -9,6 +9,7 @@ import pytest
 from flows.city import Order, tile_jobs
 from flows.drives import remove_drive
 from flows.forecast import cost_line, forecast, plan_json
+from flows.ingest import ingest_root
 from flows.plan import CityPlan, plan_city
 from flows.reconcile import hold_city
 from flows.warm_start import outside_share
@@ -17,7 +18,8 @@ from presight_core.field.files import FIELD_FILE, SHAPE_FILE
 from presight_core.recipes import aim_of, digest_of
 from presight_core.tiles import SubField
 from stages import versions
-from tests.torture.toy_city import CITY, ToyCity
+from tests.tiny_dataset import TinyDataset
+from tests.torture.toy_city import CITY, VERSION, ToyCity
 
 EVERYWHERE = SubField((0.0, 0.0, 0.0), (-1e4, -1e4, -1e4), (1e4, 1e4, 1e4))
 
@@ -116,6 +118,23 @@ def test_a_warm_started_tile_is_current_afterwards(grown):
     assert all("warm_start" in tile.recipe["inputs"]["training"]["inputs"] for tile in tiles.values())
     states = grown.workspace.catalog().tile_states.snapshot(CITY).tiles
     assert {(tile.state, tile.reasons) for tile in states} == {("published", "")}
+
+
+def test_new_ground_founds_a_tile_that_begins_with_nothing_and_no_tile_moves(city):
+    give_fields(city)
+    before = plan_of(city).tiling.tiles
+    remote = TinyDataset(city.root / "remote", VERSION)
+    for row in remote.tables["ego_pose"]:
+        row["translation"][0] += 20_000
+    ingest_root(city.root, remote.write(), VERSION, keep_going=False, as_json=False)
+    (stale,) = plan_of(city).stale
+    assert stale.start is not None
+    assert (stale.tile_id, stale.start.why_cold) == ("t002", "never built")
+    old = city.workspace.store().generation(CITY)
+    assert city.build(warm=True) == 2
+    new = city.workspace.store().generation(CITY)
+    assert plan_of(city).tiling.tiles[:2] == before
+    assert {tile_id: new.tiles[tile_id] for tile_id in old.tiles} == old.tiles
 
 
 def test_a_build_begins_with_nothing(grown):

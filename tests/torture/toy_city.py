@@ -68,7 +68,13 @@ class ToyCity:
         """Take in the drives."""
         ingest_root(self.root, self.data, VERSION, keep_going=False, as_json=False)
 
-    def build(self, wait: bool = False, overrides: tuple[str, ...] = (), warm: bool = False) -> int | None:
+    def build(
+        self,
+        wait: bool = False,
+        overrides: tuple[str, ...] = (),
+        warm: bool = False,
+        accept: tuple[str, ...] = (),
+    ) -> int | None:
         """Build and publish what is stale, as the flows do; the generation."""
         workspace = self.workspace
         settings = load_city_settings(workspace.city_file(CITY), overrides)
@@ -82,7 +88,7 @@ class ToyCity:
                 freeze(workspace, plan, lease)
             jobs = tile_jobs(workspace, plan, Order(str(self.root), CITY, warm=warm), lease)
             built = [self._written(workspace, job) for job in jobs.values()]
-            return publish(workspace, plan, built, {}, lease)["generation"]
+            return publish(workspace, plan, built, {}, lease, accept)["generation"]
 
     def example(self, tile_id: str) -> ExampleTile:
         """What the tile holds in truth."""
