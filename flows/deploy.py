@@ -2,16 +2,29 @@
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flows import prefect_settings
 from flows.console import print_json, print_table
+from flows.machines import Machines
+from flows.schedules import Schedules, crons_from
 from presight_core.errors import NotFoundError
 from storage.workspace import Workspace
 
 
-def register_city(folder: Path, city: str, asked: tuple[list[str], str, bool, str], as_json: bool) -> None:
-    """Register the city's flows and print what the server has now; `asked`: crons, timezone, on ingest, pool.
+class Asked(NamedTuple):
+    """What a user typed."""
+
+    crons: list[str]
+    timezone: str
+    on_ingest: bool
+    pool: str
+    runner: str
+    cluster: str
+
+
+def register_city(folder: Path, city: str, asked: Asked, as_json: bool) -> None:
+    """Register the city's flows and print what the server has now.
 
     Raises SettingsError for a bad schedule or server, NotFoundError for a city without drives.
     """
@@ -20,9 +33,11 @@ def register_city(folder: Path, city: str, asked: tuple[list[str], str, bool, st
     if city not in workspace.catalog().cities():
         raise NotFoundError(f"{city}: no drive of this city was ingested; `presight status` lists the cities")
     prefect_settings.prepare(log_level="WARNING")
-    from flows.deployments import Schedules, register
+    machines = Machines(asked.runner, asked.cluster)
+    schedules = Schedules(crons_from(asked.crons), asked.timezone, asked.on_ingest, asked.pool, machines)
+    from flows.deployments import register
 
-    rows = register(workspace, city, Schedules.parse(*asked))
+    rows = register(workspace, city, schedules)
     if as_json:
         print_json(rows)
         return

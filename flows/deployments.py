@@ -6,54 +6,21 @@ one waits without a process of its own; that nothing is built twice is the lease
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import httpx
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.schedules import CronSchedule
 from prefect.utilities.callables import parameter_schema
+from prefect.utilities.importtools import import_object
 
-from flows import scheduled
 from flows.prefect_settings import require_server
+from flows.schedules import AFTER_INGEST, FLOWS, ONE_AT_A_TIME, Schedules
 from presight_core.errors import ConflictError, SettingsError
 from storage.workspace import Workspace
 
-FLOWS: dict[str, Any] = {
-    "rebuild": scheduled.rebuild,
-    "reconcile": scheduled.reconcile_city,
-    "gc": scheduled.collect_garbage,
-}
-ONE_AT_A_TIME = ("rebuild",)  # these build; the others may run beside them
-AFTER_INGEST = "rebuild"
 TAG = "presight"
 ON_INGEST_TAG = "on-ingest"
 SLOT_GRACE_S = 60  # after which Prefect gives the slot of a dead run to the next; the least that it accepts
-
-
-@dataclass(frozen=True)
-class Schedules:
-    """When which flows of a city start."""
-
-    crons: dict[str, str] = field(default_factory=dict)  # by flow; one without starts by hand or by an event only
-    timezone: str = "UTC"
-    on_ingest: bool = False
-    pool: str = "presight"
-
-    def __post_init__(self) -> None:
-        for flow, cron in self.crons.items():
-            _check(flow, cron)
-        try:
-            ZoneInfo(self.timezone)
-        except (ZoneInfoNotFoundError, ValueError):
-            raise SettingsError(f"--timezone {self.timezone}: no such zone; write one as Asia/Singapore") from None
-
-    @staticmethod
-    def parse(crons: list[str], timezone: str, on_ingest: bool, pool: str) -> "Schedules":
-        """Schedules from `CRON` or `FLOW=CRON` texts. Raises SettingsError for a text that is neither."""
-        named = [text.partition("=") if "=" in text else ("rebuild", "=", text) for text in crons]
-        return Schedules({flow.strip(): cron.strip() for flow, _, cron in named}, timezone, on_ingest, pool)
 
 
 def register(workspace: Workspace, city: str, schedules: Schedules) -> list[dict[str, Any]]:
@@ -97,10 +64,12 @@ def start_after_ingest(workspace: Workspace, cities: list[str]) -> dict[str, str
 def _register(
     server: Any, workspace: Workspace, city: str, flow: str, schedules: Schedules, slot: str
 ) -> dict[str, Any]:
-    function, cron = FLOWS[flow], schedules.crons.get(flow)
-    flow_id = server.request("POST", "/flows/", json={"name": function.name}).json()["id"]
+    cron = schedules.crons.get(flow)
+    flow_id = server.request("POST", "/flows/", json={"name": flow}).json()["id"]
     starts_on_ingest = schedules.on_ingest and flow == AFTER_INGEST
     parameters = {"workspace": str(workspace.root), "city": city}
+    if flow in ONE_AT_A_TIME:
+        parameters |= {"runner": schedules.machines.runner, "cluster": schedules.machines.cluster}
     timing = {"schedule": {"cron": cron, "timezone": schedules.timezone}, "active": True}
     limit = {
         "global_concurrency_limit_id": slot,
@@ -109,10 +78,10 @@ def _register(
     asked = {
         "name": city,
         "flow_id": flow_id,
-        "entrypoint": f"{function.fn.__module__}.{function.fn.__name__}",
+        "entrypoint": FLOWS[flow],
         "work_pool_name": schedules.pool,
         "parameters": parameters,
-        "parameter_openapi_schema": parameter_schema(function).model_dump(mode="json"),
+        "parameter_openapi_schema": parameter_schema(import_object(FLOWS[flow])).model_dump(mode="json"),
         "schedules": [timing] if cron else [],
         "tags": [TAG, ON_INGEST_TAG] if starts_on_ingest else [TAG],
         **(limit if flow in ONE_AT_A_TIME else {}),
@@ -168,17 +137,6 @@ def _start(server: Any, deployment_id: str) -> str:
 
 def _slot_name(city: str) -> str:
     return f"presight-{city}"
-
-
-def _check(flow: str, cron: str) -> None:
-    if flow not in FLOWS:
-        raise SettingsError(f"--cron {flow}=...: no such flow; there are {', '.join(FLOWS)}")
-    try:
-        CronSchedule(cron=cron)
-    except ValueError:
-        raise SettingsError(
-            f"--cron {cron!r} is no schedule; write minute, hour, day, month and weekday: '0 2 * * 6' is Saturdays at 2"
-        ) from None
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from flows.options import AsJson, City
+from flows.options import AsJson, City, Cluster, Runner
 
 app = typer.Typer()
 
@@ -22,16 +22,19 @@ def deploy(
     timezone: Annotated[str, typer.Option(help="Zone of the schedules, for example Asia/Singapore.")] = "UTC",
     on_ingest: Annotated[bool, typer.Option("--on-ingest", help="Start an update when a drive was ingested.")] = False,
     pool: Pool = "presight",
+    runner: Runner = "threads",
+    cluster: Cluster = "",
     remove: Annotated[bool, typer.Option("--remove", help="Take all of the city off the server.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Register a city's flows on the Prefect server of PREFECT_API_URL, in place of what was registered."""
-    from flows.deploy import register_city, remove_city
+    from flows.deploy import Asked, register_city, remove_city
 
     if remove:
         remove_city(context.obj, city, as_json)
     else:
-        register_city(context.obj, city, (cron or [], timezone, on_ingest, pool), as_json)
+        asked = Asked(cron or [], timezone, on_ingest, pool, runner, cluster)
+        register_city(context.obj, city, asked, as_json)
 
 
 @app.command("serve-flows")

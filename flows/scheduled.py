@@ -10,12 +10,10 @@ from typing import Any
 
 from prefect import flow
 
-from flows.city import run_city
-from flows.plan import plan_city
+from flows.build import Request, bring_up_to_date, require_whole, run_flow
+from flows.machines import Machines
 from flows.reconcile import reconcile
 from flows.store_care import opened as opened_store
-from presight_core.config import load_city_settings
-from presight_core.errors import BuildError
 from storage.retention import Retention, collect
 from storage.workspace import Workspace
 
@@ -29,17 +27,15 @@ ENDINGS: Any = {"on_crashed": [end_in_catalog], "on_cancellation": [end_in_catal
 
 
 @flow(name="rebuild", flow_run_name="rebuild {city}", **ENDINGS)
-def rebuild(workspace: str, city: str, wait: bool = True) -> dict[str, Any]:
+def rebuild(workspace: str, city: str, runner: str = "threads", cluster: str = "", wait: bool = True) -> dict[str, Any]:
     """Build and publish what is stale of a city, as `presight build`. Raises BuildError if a tile failed."""
-    opened = Workspace.open(Path(workspace)).require()
-    reconcile(opened, city)
-    plan = plan_city(opened, city, load_city_settings(opened.city_file(city)))
-    if plan.is_current:
-        return {"generation": plan.generation, "published": [], "failed": {}, "withdrawn": {}}
-    outcome = run_city(opened, plan, [], None, wait)
-    if outcome["failed"]:
-        raise BuildError(f"{city}: {len(outcome['failed'])} tiles failed and keep their old state: {outcome['failed']}")
-    return outcome
+    return _built(workspace, Request(city, machines=Machines(runner, cluster), wait=wait))
+
+
+@flow(name="update", flow_run_name="update {city}", **ENDINGS)
+def update(workspace: str, city: str, runner: str = "threads", cluster: str = "", wait: bool = True) -> dict[str, Any]:
+    """The same as `presight update`: tiles go on from the fields that they have."""
+    return _built(workspace, Request(city, machines=Machines(runner, cluster), wait=wait, warm=True))
 
 
 @flow(name="reconcile", flow_run_name="reconcile {city}", persist_result=False)
@@ -55,3 +51,9 @@ def collect_garbage(workspace: str, city: str, keep: int = 20, grace_days: float
     store, now = opened_store(Path(workspace), city), datetime.now(UTC)
     garbage = collect(store.location, city, Retention(keep, timedelta(days=grace_days)), now)
     return {"generations": len(garbage.generations), "builds": len(garbage.builds), "bytes": garbage.size_bytes}
+
+
+def _built(workspace: str, request: Request) -> dict[str, Any]:
+    outcome = bring_up_to_date(Workspace.open(Path(workspace)), request, run_flow)
+    require_whole(request.city, outcome)
+    return outcome

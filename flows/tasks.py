@@ -19,6 +19,8 @@ def only_time_can_cure(_task: Any, _run: Any, state: Any) -> bool:
     return isinstance(getattr(state.data, "result", state.data), WorkerLostError | ConflictError)
 
 
+QUEUED = Progress("", 0, 0)  # nobody works on it
+
 # The catalog holds the truth, so Prefect neither caches nor persists results.
 OPTIONS: dict[str, Any] = {
     "cache_policy": NO_CACHE,
@@ -43,7 +45,9 @@ def extract_features(job: Job) -> dict[str, Any]:
 @task(name="train-tile", task_run_name="train {job.tile_id}", tags=["gpu"], **OPTIONS)
 def train_tile(job: Job) -> dict[str, Any]:
     """Train and evaluate one tile's field."""
-    return _work("train", job)
+    trained = _work("train", job)
+    job.opened_workspace.catalog().progress(job.build_id, QUEUED)  # until its extraction has its turn
+    return trained
 
 
 @task(name="extract-tile", task_run_name="extract {job.tile_id}", tags=["gpu"], **OPTIONS)
