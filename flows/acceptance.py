@@ -30,8 +30,10 @@ class Built:
         counts = {f"extraction_{name}": count for name, count in self.extracted["counts"].items()}
         extraction_s = self.extracted["seconds"]
         seconds = round(trained.get("seconds", 0.0) + extraction_s, 1)
+        lost = self.trained.get("lost_workers", 0) + self.extracted.get("lost_workers", 0)
         sizes = {"voxels": entry["voxel_count"], "bytes": entry["bytes"]}
-        return {**trained, **counts, **sizes, "seconds": seconds, "extraction_seconds": extraction_s, **self.compared}
+        took = {"seconds": seconds, "extraction_seconds": extraction_s} | ({"lost_workers": lost} if lost else {})
+        return {**trained, **counts, **sizes, **took, **self.compared}
 
     def tile(self, drive_names: Mapping[str, str] | None = None) -> GenerationTile:
         """The tile as a generation shows it, with the names of its drives by their ids."""

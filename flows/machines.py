@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
+from flows.prefect_settings import require_server
 from presight_core.config import ResourceSettings
 from presight_core.errors import MissingDependencyError, SettingsError
 
@@ -47,6 +48,7 @@ def crew_of(machines: Machines, resources: ResourceSettings, stale_count: int) -
         return _threads_crew(machines.parallel, stale_count)
     if find_spec("prefect_dask") is None:
         raise MissingDependencyError("--runner dask needs the extra: pip install 'presight[pipeline,dask]'")
+    require_server()  # one that every worker reaches; without it each of them starts one of its own, in half a minute
     from prefect_dask.task_runners import DaskTaskRunner
 
     _require_able(machines.cluster, asked(resources))

@@ -3,6 +3,7 @@
 Parameters and results are references and small figures (JSON), never arrays.
 """
 
+from dataclasses import replace
 from typing import Any
 
 from prefect import task
@@ -12,6 +13,8 @@ from flows.jobs import Job
 from flows.launch import WorkerLostError, run_job
 from presight_core.errors import BuildError, ConflictError
 from presight_core.progress import Progress
+from storage.catalog import Build
+from storage.tile_states import CITY_ROW
 
 
 def only_time_can_cure(_task: Any, _run: Any, state: Any) -> bool:
@@ -57,11 +60,23 @@ def extract_tile(job: Job) -> dict[str, Any]:
 
 
 def _work(command: str, job: Job) -> dict[str, Any]:
-    """Run a job and let the catalog know how far it is."""
+    """Run a job and let the catalog know how far it is, and how many workers died at it before."""
     catalog = job.opened_workspace.catalog()
+    given_up = BuildError(f"{command}: somebody ended build {job.build_id} in the catalog; its work is given up")
+    row = next((build for build in catalog.running(job.city) if build.build_id == job.build_id), None)
+    if row is None:
+        raise given_up
+    lost = _lost_workers(row)
 
     def report(progress: Progress) -> None:
-        if not catalog.progress(job.build_id, progress):
-            raise BuildError(f"{command}: somebody ended build {job.build_id} in the catalog; its work is given up")
+        if not catalog.progress(job.build_id, replace(progress, figures={**progress.figures, **lost})):
+            raise given_up
 
-    return run_job(command, job, report)
+    return {**run_job(command, job, report), **lost}
+
+
+def _lost_workers(row: Build) -> dict[str, float]:
+    """Their number, if there are any: a tile's row that nobody works on has no stage."""
+    if row.tile_id == CITY_ROW or row.stage == QUEUED.stage:
+        return {}
+    return {"lost_workers": row.figures.get("lost_workers", 0) + 1}

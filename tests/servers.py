@@ -57,9 +57,9 @@ def postgres_server() -> Iterator[str]:
 def s3_server() -> Iterator[dict[str, str]]:
     """A new SeaweedFS with the bucket `presight` on loopback; the environment that reaches it as s3://presight/."""
     program = Path(sys.executable).parent / "weed"
-    ports = dict(zip(("master", "volume", "filer", "s3", "admin"), _free_ports(10), strict=False))
+    ports = dict(zip(("master", "volume", "filer", "s3", "admin"), free_ports(10), strict=False))
     options = [f"-{name}.port={port}" for name, port in ports.items()]
-    options += [f"-{name}.port.grpc={port}" for name, port in zip(ports, _free_ports(10)[5:], strict=True)]
+    options += [f"-{name}.port.grpc={port}" for name, port in zip(ports, free_ports(10)[5:], strict=True)]
     off = ["-admin.ui=false", "-webdav=false", "-master.telemetry=false", "-s3.port.iceberg=0", "-s3.port.lance=0"]
     with tempfile.TemporaryDirectory(prefix="presight-s3-") as folder:
         place = [f"-dir={folder}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1", f"-bucket={S3_BUCKET}"]
@@ -89,7 +89,7 @@ class PrefectServer:
     """A Prefect server on loopback, one process, all of it in one folder; it may be killed and come back."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, (self._port,) = folder, _free_ports(1)
+        self._folder, (self._port,) = folder, free_ports(1)
         self.url = f"http://127.0.0.1:{self._port}/api"
         self.environment = {
             "PREFECT_API_URL": self.url,
@@ -169,7 +169,7 @@ def _has_bucket(port: int, log: Path) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0 and b"Press Ctrl+C" in log.read_bytes()
 
 
-def _free_ports(count: int) -> list[int]:
+def free_ports(count: int) -> list[int]:
     sockets = [socket.socket() for _ in range(count)]
     for each in sockets:
         each.bind(("127.0.0.1", 0))

@@ -4,15 +4,27 @@ import json
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 
+import httpx
 import pytest
 
 from tests.flows.scheduler import Scheduler, eventually
-from tests.torture.toy_city import CITY, ToyCity
+from tests.flows.toy_worker import work_of
+from tests.torture.toy_city import CITY, VERSION, ToyCity
 
 pytestmark = pytest.mark.slow
 
-REBUILD = f"rebuild/{CITY}"
+REBUILD, UPDATE = f"rebuild/{CITY}", f"update/{CITY}"
+
+
+@pytest.fixture
+def forgetful(scheduler: Scheduler) -> Iterator[Scheduler]:
+    """The server, which forgets the city after the test, however that ends."""
+    yield scheduler
+    for run in ("rebuild", "update", "reconcile", "gc"):
+        with suppress(httpx.HTTPStatusError):
+            scheduler.call("DELETE", f"/deployments/{scheduler.call('GET', f'/deployments/name/{run}/{CITY}')['id']}")
 
 
 @pytest.fixture(scope="module")
@@ -33,16 +45,16 @@ def started(scheduler: Scheduler, city: ToyCity) -> tuple[str, int]:
     return run, work_of(city, "train")[0]["parent"]
 
 
-def work_of(city: ToyCity, what: str) -> list[dict]:
-    """What workers began, in order."""
-    log = city.root / "work.log"
-    lines = log.read_text().splitlines() if log.exists() else []
-    return [entry for entry in map(json.loads, lines) if entry["what"] == what]
-
-
 def release(city: ToyCity) -> None:
     """Let the trainings end."""
     (city.root / "hold").unlink()
+
+
+def ingested_again(scheduler: Scheduler, city: ToyCity, scene: str) -> list[str]:
+    """Remove a drive and take it in again; the runs that this started."""
+    assert scheduler.presight(city.root, "drives", "remove", scene).returncode == 0
+    result = scheduler.presight(city.root, "ingest", city.data, "--version", VERSION, "--json")
+    return list(json.loads(result.stdout)["started"].values())
 
 
 def check_built_once(city: ToyCity) -> None:
@@ -69,11 +81,13 @@ def check_next_run(city: ToyCity) -> None:
     city.check_catalog()
 
 
-def test_a_schedule_builds_the_city_and_its_second_run_waits_for_the_first(scheduler, new_city):
+def test_a_schedule_builds_the_city_and_its_second_run_waits_for_the_first(forgetful, new_city):
+    scheduler = forgetful
     (new_city.root / "hold").touch()
     result = scheduler.presight(new_city.root, "deploy", CITY, "--cron", "* * * * * */30", "--json")
     registered = {row["deployment"]: row for row in json.loads(result.stdout)}
-    assert registered[REBUILD]["parameters"] == {"workspace": str(new_city.root), "city": CITY}
+    machines = {"runner": "threads", "cluster": ""}
+    assert registered[REBUILD]["parameters"] == {"workspace": str(new_city.root), "city": CITY, **machines}
     scheduler.start_worker()
     first, second = eventually(lambda: scheduler.runs(REBUILD)[:2])
     assert first["auto_scheduled"]
@@ -86,6 +100,17 @@ def test_a_schedule_builds_the_city_and_its_second_run_waits_for_the_first(sched
     check_built_once(new_city)
     assert scheduler.presight(new_city.root, "deploy", CITY, "--remove").returncode == 0
     assert scheduler.presight(new_city.root, "deploy", CITY, "--remove").stdout == f"{CITY}: nothing removed\n"
+
+
+def test_an_ingest_starts_an_update_and_a_second_one_before_it_begins_does_not(forgetful, new_city):
+    forgetful.end_worker()
+    assert forgetful.presight(new_city.root, "deploy", CITY, "--on-ingest").returncode == 0
+    assert ingested_again(forgetful, new_city, "scene-0000") == [run["id"] for run in forgetful.runs(UPDATE)]
+    (run,) = ingested_again(forgetful, new_city, "scene-0001")
+    assert [run] == [run["id"] for run in forgetful.runs(UPDATE)]
+    forgetful.start_worker()
+    assert forgetful.until(run)["type"] == "COMPLETED"
+    check_built_once(new_city)
 
 
 def test_a_cancelled_run_is_ended_in_the_catalog(deployed, new_city):

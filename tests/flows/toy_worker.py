@@ -17,9 +17,16 @@ from flows.jobs import Job, recipe_from
 from presight_core.priors.example import ExampleTile
 from presight_core.progress import Progress
 from storage.tile_groups import TileName
+from tests.torture.toy_city import CHANNELS, ToyCity
 
-CHANNELS = 8
 STEPS = 1000
+
+
+def work_of(city: ToyCity, what: str) -> list[dict[str, Any]]:
+    """What workers began in a city, in order."""
+    log = city.root / "work.log"
+    lines = log.read_text().splitlines() if log.exists() else []
+    return [entry for entry in map(json.loads, lines) if entry["what"] == what]
 
 
 def train(job: Job, root: Path) -> dict[str, Any]:
