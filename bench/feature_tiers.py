@@ -53,7 +53,8 @@ def main() -> None:
                 started = time.perf_counter()
                 scratch = Path(folder) / f"{tier}{seed}"
                 result = train_tile(job, sources[tier], scratch)
-                figures = evaluate_tile(job, load_field(result.folder, "cpu"), sources["exact"], scratch / "pictures")
+                field = load_field(result.folder, "cpu")
+                figures = evaluate_tile(job, field, sources["exact"], scratch / "pictures").metrics
                 shown = "  ".join(f"{name} {value:.4f}" for name, value in sorted(figures.items()))
                 print(f"{tier:8} seed {seed}  {shown}  {time.perf_counter() - started:.0f} s", flush=True)
 

@@ -42,7 +42,7 @@ def main() -> None:
         tile = open_tile(options.workspace, options.city, 0, [*options.set, *VARIANTS[name]], options.threads)
         results[name] = []
         for step, minutes, field in train(tile, marks_of(options.at)):
-            figures = evaluate_tile(tile.job, field, tile.source, out / name.replace(" ", "-"))
+            figures = evaluate_tile(tile.job, field, tile.source, out / name.replace(" ", "-")).metrics
             results[name].append({"steps": step, "minutes": minutes, **figures})
             cells = (f"{results[name][-1].get(column, float('nan')):.4g}" for column in COLUMNS)
             print(f"| {name} | " + " | ".join(cells) + " |", flush=True)

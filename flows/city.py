@@ -1,15 +1,16 @@
-"""The flow `rebuild_city`: everything stale of one city, tiles in parallel, one published generation."""
+"""The flows `rebuild_city` and `update_city`: what is stale of one city, tiles in parallel, one generation."""
 
-import os
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from prefect import flow
-from prefect.task_runners import ThreadPoolTaskRunner
 
 from flows import tasks
 from flows.jobs import Job
+from flows.machines import Crew, asking, is_on_cluster
 from flows.plan import CityPlan, plan_city, record_plan
 from flows.publication import Built, publish
 from flows.reconcile import hold_city
@@ -21,55 +22,78 @@ from storage.tile_states import CITY_ROW
 from storage.workspace import Workspace
 
 
+@dataclass(frozen=True)
+class Order:
+    """What one run shall do: references only."""
+
+    workspace: str
+    city: str
+    overrides: Sequence[str] = ()
+    threads: int = 1  # of each tile
+    devices: Sequence[str] = ("cpu",)
+    wait: bool = False  # while another run builds the city
+    accept: Sequence[str] = ()  # tiles, by name or pattern, that may differ from their old build as they like
+    warm: bool = False  # go on from the fields that tiles have, where their recipes allow it
+
+
 @flow(name="rebuild_city", flow_run_name="rebuild {city}", persist_result=False)
-def rebuild_city(
+def rebuild_city(  # noqa: PLR0913, PLR0917 - what a deployment shows
     workspace: str,
     city: str,
     overrides: list[str] | None = None,
     threads: int = 1,
     devices: list[str] | None = None,
     wait: bool = False,
+    accept: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Build and publish what is stale. A tile that fails keeps its old build and is named in the result.
+    """Build what is stale from nothing, and publish it.
 
-    While another run builds the city this one waits, or raises LeaseHeldError.
+    A tile that fails keeps its old build and is named in the result. While another run builds the city this one
+    waits, or raises LeaseHeldError.
     """
-    opened = Workspace.open(Path(workspace))
-    settings = load_city_settings(opened.city_file(city), overrides or ())
-    with hold_city(opened, city, wait) as lease:
-        plan = plan_city(opened, city, settings)
+    return _bring_up_to_date(Order(workspace, city, overrides or (), threads, devices or ["cpu"], wait, accept or ()))
+
+
+@flow(name="update_city", flow_run_name="update {city}", persist_result=False)
+def update_city(  # noqa: PLR0913, PLR0917 - likewise
+    workspace: str,
+    city: str,
+    overrides: list[str] | None = None,
+    threads: int = 1,
+    devices: list[str] | None = None,
+    wait: bool = False,
+    accept: list[str] | None = None,
+) -> dict[str, Any]:
+    """As `rebuild_city`, but tiles that only got new drives go on from the field that they have."""
+    order = Order(workspace, city, overrides or (), threads, devices or ["cpu"], wait, accept or ())
+    return _bring_up_to_date(replace(order, warm=True))
+
+
+def run_city(order: Order, crew: Crew) -> dict[str, Any]:
+    """Run the flow with this crew."""
+    run = (update_city if order.warm else rebuild_city).with_options(task_runner=crew.task_runner)
+    devices, accept = list(crew.devices), list(order.accept)
+    return run(order.workspace, order.city, list(order.overrides), crew.threads, devices, order.wait, accept=accept)
+
+
+def _bring_up_to_date(order: Order) -> dict[str, Any]:
+    opened = Workspace.open(Path(order.workspace))
+    settings = load_city_settings(opened.city_file(order.city), order.overrides)
+    with hold_city(opened, order.city, order.wait) as lease:
+        plan = plan_city(opened, order.city, settings)
         if plan.stale and plan.space_id is None:
-            _fit_space(opened, plan, threads, lease)
-            plan = plan_city(opened, city, settings)
+            _fit_space(opened, plan, order.threads, lease)
+            plan = plan_city(opened, order.city, settings)
         record_plan(opened, plan)
         if plan.is_current:
             return {"generation": plan.generation, "published": [], "failed": {}, "withdrawn": {}}
         if not plan.stale:
             return publish(opened, plan, [], {}, lease)
         freeze(opened, plan, lease)
-        broken = _extract_features(opened, plan, threads, lease)
-        built, failed = _build_tiles(tile_jobs(opened, plan, threads, devices or ["cpu"], lease), broken)
-        return publish(opened, plan, built, failed, lease)
-
-
-def run_city(
-    workspace: Workspace, plan: CityPlan, overrides: list[str], parallel: int | None, wait: bool = False
-) -> dict[str, Any]:
-    """Run the flow on this machine, as many tiles at once as it has GPUs, or else cores."""
-    devices = available_devices()
-    cores = len(os.sched_getaffinity(0))
-    wanted = parallel or (cores if devices == ["cpu"] else len(devices))
-    at_once = max(1, min(wanted, len(plan.stale)))
-    runner: Any = ThreadPoolTaskRunner(max_workers=at_once)  # Prefect's own types do not fit each other here
-    run = rebuild_city.with_options(task_runner=runner)
-    return run(str(workspace.root), plan.city, overrides, max(1, cores // at_once), devices, wait)
-
-
-def available_devices() -> list[str]:
-    """The GPUs of this machine, or else its processor."""
-    import torch
-
-    return [f"cuda:{index}" for index in range(torch.cuda.device_count())] or ["cpu"]
+        with asking(settings.resources):
+            broken = _extract_features(opened, plan, order.threads, lease)
+            built, failed = _build_tiles(tile_jobs(opened, plan, order, lease), broken)
+        return publish(opened, plan, built, failed, lease, order.accept)
 
 
 def freeze(workspace: Workspace, plan: CityPlan, lease: Lease) -> None:
@@ -106,29 +130,35 @@ def _extract_features(workspace: Workspace, plan: CityPlan, threads: int, lease:
         return {}
     build_id = catalog.start_build(plan.city, CITY_ROW, plan.features, lease)
     job = _job(workspace, plan, build_id, threads)
+    ends: dict[str, Callable[[], Any]] = {}
+    for drive_id in missing:
+        of_drive = replace(job, drive_ids=(drive_id,))
+        # Here one after the other: a session uses all threads, and the disk is the limit. On a cluster all at once.
+        spread = tasks.extract_features.submit(of_drive).result if is_on_cluster() else None
+        ends[drive_id] = spread or partial(tasks.extract_features, of_drive)
     broken: dict[str, str] = {}
-    for drive_id in missing:  # one after the other: a session uses all threads, and the disk is the limit
-        state = tasks.extract_features(replace(job, drive_ids=(drive_id,)), return_state=True)
-        if state.is_failed():
-            broken[drive_id] = str(state.result(raise_on_failure=False))
+    for drive_id, end in ends.items():
+        try:
+            end()
+        except Exception as error:  # it must not sink the tiles that do without the drive
+            broken[drive_id] = str(error)
     catalog.finish_build(build_id, "failed" if broken else "built", {}, "; ".join(broken.values()))
     return broken
 
 
-def tile_jobs(workspace: Workspace, plan: CityPlan, threads: int, devices: list[str], lease: Lease) -> dict[str, Job]:
+def tile_jobs(workspace: Workspace, plan: CityPlan, order: Order, lease: Lease) -> dict[str, Job]:
     """A job for every stale tile, each with a row in the catalog."""
     jobs = {}
     for index, tile in enumerate(plan.stale):
-        assert tile.recipe is not None
-        assert tile.training is not None
-        build_id = workspace.catalog().start_build(plan.city, tile.tile_id, tile.recipe, lease)
+        training, whole = tile.recipes(order.warm)
+        build_id = workspace.catalog().start_build(plan.city, tile.tile_id, whole, lease)
         jobs[tile.tile_id] = replace(
-            _job(workspace, plan, build_id, threads),
-            device=devices[index % len(devices)],
+            _job(workspace, plan, build_id, order.threads),
+            device=order.devices[index % len(order.devices)],
             drive_ids=tile.drive_ids,
             tile=tile.tile,
-            training_recipe=tile.training.to_json(),
-            recipe=tile.recipe.to_json(),
+            training_recipe=training.to_json(),
+            recipe=whole.to_json(),
         )
     return jobs
 

@@ -6,10 +6,10 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from flows import store_commands
+from flows import schedule_commands, store_commands
 from flows.feature_commands import features
 from flows.model_commands import models
-from flows.options import AsJson, City, Overrides
+from flows.options import AsJson, City, Cluster, Overrides, Runner
 from presight_core.errors import MissingDependencyError, PresightError, StoreError
 
 app = typer.Typer(
@@ -74,23 +74,54 @@ def plan(context: typer.Context, city: City, override: Overrides = None, as_json
     show_plan(context.obj, city, override or [], as_json)
 
 
+Parallel = Annotated[
+    int | None, typer.Option(min=1, help="Tiles at once here; as many as GPUs, or else cores, if not given.")
+]
+Wait = Annotated[bool, typer.Option("--wait", help="Wait while another run builds the city, rather than refuse.")]
+Accept = Annotated[
+    list[str] | None,
+    typer.Option(metavar="TILE", help="Publish the tile (or all of a pattern) however it differs from its old build."),
+]
+
+
 @app.command()
 def build(
     context: typer.Context,
     city: City,
     override: Overrides = None,
-    parallel: Annotated[
-        int | None, typer.Option(min=1, help="Tiles at once; as many as GPUs, or else cores, if not given.")
-    ] = None,
-    wait: Annotated[
-        bool, typer.Option("--wait", help="Wait while another run builds the city, rather than refuse.")
-    ] = False,
+    parallel: Parallel = None,
+    runner: Runner = "threads",
+    cluster: Cluster = "",
+    wait: Wait = False,
+    accept: Accept = None,
     as_json: AsJson = False,
 ) -> None:
-    """Build and publish what is stale of a city: features, training, extraction, validation."""
-    from flows.build import build_city
+    """Build and publish what is stale of a city, from nothing: features, training, extraction, validation."""
+    from flows.build import Request, build_city
+    from flows.machines import Machines
 
-    build_city(context.obj, city, override or [], parallel, as_json, wait)
+    machines = Machines(runner, cluster, parallel)
+    build_city(context.obj, Request(city, override or [], machines, wait, accept or [], warm=False, as_json=as_json))
+
+
+@app.command()
+def update(
+    context: typer.Context,
+    city: City,
+    override: Overrides = None,
+    parallel: Parallel = None,
+    runner: Runner = "threads",
+    cluster: Cluster = "",
+    wait: Wait = False,
+    accept: Accept = None,
+    as_json: AsJson = False,
+) -> None:
+    """As build, but a tile that only got new drives goes on from the field that it has, which takes fewer steps."""
+    from flows.build import Request, build_city
+    from flows.machines import Machines
+
+    machines = Machines(runner, cluster, parallel)
+    build_city(context.obj, Request(city, override or [], machines, wait, accept or [], warm=True, as_json=as_json))
 
 
 @drive_commands.command("list")
@@ -224,6 +255,7 @@ def doctor(context: typer.Context, as_json: AsJson = False) -> None:
     show_findings(context.obj, as_json)
 
 
+app.add_typer(schedule_commands.app)
 app.add_typer(store_commands.app)
 
 

@@ -30,6 +30,7 @@ def generate_city(out: Path, name: str, seed: int, overrides: list[str]) -> None
 
 def run_demo(folder: Path, overrides: list[str]) -> None:
     """Generate the small city, build its priors through the flow, draw them, and say where to look."""
+    from flows.build import Request as BuildRequest
     from flows.build import build_city
     from flows.ingest import ingest_root
     from flows.report import write_report
@@ -40,7 +41,7 @@ def run_demo(folder: Path, overrides: list[str]) -> None:
     data = folder / "embedded-city"
     generate_city(data, "demo", seed=0, overrides=[])
     ingest_root(folder, data, VERSION, keep_going=False, as_json=False)
-    build_city(folder, CITY, overrides, parallel=None, as_json=False)
+    build_city(folder, BuildRequest(CITY, overrides))
     show_status(folder, Request(CITY))
     page = write_report(folder, CITY, None)
     print(f"done in {time.monotonic() - started:.0f} s; look at {page}")

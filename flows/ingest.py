@@ -5,6 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from flows.console import print_json, progress_bars
+from flows.deploy import announce_ingest
 from presight_core.drives import Reject
 from presight_core.errors import InputError
 from stages.ingest import IngestedDrive, ingest_nuscenes
@@ -37,14 +38,18 @@ def ingest_root(
         added_at = index.add(ingested.drive, ingested.frames, ingested.rejects, catalog.now())
         is_new = catalog.add_drive(ingested.drive, ingested.rejects, added_at)
         rows.append({**asdict(ingested.drive), "new": is_new, "rejects": [asdict(r) for r in ingested.rejects]})
+    started = announce_ingest(workspace, sorted({row["city"] for row in rows if row["new"]}))
     if as_json:
-        print_json({"workspace": str(workspace.root), "drives": rows, "left_out": len(drives) - len(usable)})
+        left_out = len(drives) - len(usable)
+        print_json({"workspace": str(workspace.root), "drives": rows, "left_out": left_out, "started": started})
         return
     for row in rows:
         what = "new" if row["new"] else "already known"
         print(f"{row['city']}  {row['name']}  {row['frame_count']} frames  {len(row['rejects'])} rejects  {what}")
     new, left_out = sum(row["new"] for row in rows), len(drives) - len(usable)
     print(f"{len(rows)} drives, {new} new, {left_out} left out; next: presight plan {rows[0]['city']}")
+    for city, run in started.items():
+        print(f"{city}: the Prefect server brings it up to date in run {run}")
 
 
 def _usable(drives: list[IngestedDrive], keep_going: bool) -> list[IngestedDrive]:

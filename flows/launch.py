@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections import deque
@@ -12,7 +13,8 @@ from presight_core import errors
 from presight_core.errors import BuildError, PresightError
 from presight_core.progress import Progress, Report, silent
 
-WORKER = (sys.executable, "-m", "flows.worker")
+# PRESIGHT_WORKER: another command that does a job, for example `srun --gpus=1 python -m flows.worker`.
+WORKER = shlex.split(os.environ.get("PRESIGHT_WORKER", "")) or [sys.executable, "-m", "flows.worker"]
 KEPT_LINES = 12  # of a crashed worker's output: a traceback's end
 
 

@@ -12,3 +12,7 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, for example training.steps=2000."),
 ]
+Runner = Annotated[str, typer.Option(help="Who builds tiles: threads of this machine, or dask.")]
+Cluster = Annotated[
+    str, typer.Option(metavar="ADDRESS", envvar="PRESIGHT_CLUSTER", help="Scheduler of --runner dask, tcp://HOST:8786.")
+]

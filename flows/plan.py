@@ -4,7 +4,7 @@ Planning reads and never writes, but for `record_plan`; it imports neither torch
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from flows.drives import CityDrives, choose_drives, require_split_apart
 from flows.staleness import Reason, stale_reasons
+from flows.warm_start import StaleTile, Start, find_start
 from presight_core import masking
 from presight_core.config import CitySettings
 from presight_core.drives import Drive, FrameTable
@@ -63,6 +64,15 @@ class TilePlan:
     past: Build | None  # its last build that was published
     voxel_count: int  # of the published build, 0 if none
     bytes: int  # likewise
+    start: Start | None = None  # of an update; None if it is current, or its recipe is not known
+
+    def recipes(self, warm: bool) -> tuple[Recipe, Recipe]:
+        """The recipes of the training and of the whole tile: as an update follows them, or from nothing."""
+        assert self.training is not None
+        assert self.recipe is not None
+        if not (warm and self.start):
+            return self.training, self.recipe
+        return self.start.training, replace(self.recipe, inputs={"training": self.start.training.to_json()})
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -135,6 +145,12 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
             (None, None) if features is None else _recipes(city_tiling, index, members, settings, features)
         )
         shown = generation.tiles.get(tile.tile_id) if generation else None
+        published = shown.recipe if shown else None
+        causes = compare(published, recipe.to_json() if recipe else None)
+        start = None
+        if causes and training:
+            stale = StaleTile(city, tile.tile_id, training, causes, members.positions)
+            start = find_start(workspace, stale, published, settings)
         tiles.append(
             TilePlan(
                 tile=index,
@@ -143,10 +159,11 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
                 frame_count=len(members),
                 training=training,
                 recipe=recipe,
-                causes=compare(shown.recipe if shown else None, recipe.to_json() if recipe else None),
+                causes=causes,
                 past=past.get(tile.tile_id),
                 voxel_count=shown.entry.voxel_count if shown else 0,
                 bytes=shown.entry.bytes if shown else 0,
+                start=start,
             )
         )
     return CityPlan(

@@ -8,7 +8,7 @@ import numpy as np
 
 from flows.drives import CityDrives
 from presight_core.errors import NotFoundError, StoreError
-from presight_core.recipes import differences
+from presight_core.recipes import aim_of, differences
 from storage.drives import DriveIndex
 
 Kind = Literal[
@@ -41,7 +41,7 @@ def stale_reasons(
         return (Reason("never built", "never built"),)
     if today is None:
         return (Reason("model", "the feature space is not fitted"),)
-    lines = [tuple(line.split(": ", 1)) for line in differences(dict(published), dict(today))]
+    lines = [tuple(line.split(": ", 1)) for line in differences(aim_of(published), aim_of(today))]
     drives = [change.rsplit(" ", 1) for path, change in lines if path == "inputs.training.inputs.drives"]
     others = [_reason(path, change) for path, change in lines if path != "inputs.training.inputs.drives"]
     added = [drive_id for drive_id, what in drives if what == "added"]

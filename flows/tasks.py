@@ -3,6 +3,7 @@
 Parameters and results are references and small figures (JSON), never arrays.
 """
 
+from dataclasses import replace
 from typing import Any
 
 from prefect import task
@@ -13,12 +14,16 @@ from flows.launch import WorkerLostError, run_job
 from flows.pace import Pace
 from presight_core.errors import BuildError, ConflictError
 from presight_core.progress import Progress
+from storage.catalog import Build
+from storage.tile_states import CITY_ROW
 
 
 def only_time_can_cure(_task: Any, _run: Any, state: Any) -> bool:
     """Whether a failure may pass by itself: a lost race or a killed worker, never bad data or settings."""
     return isinstance(getattr(state.data, "result", state.data), WorkerLostError | ConflictError)
 
+
+QUEUED = Progress("", 0, 0)  # nobody works on it
 
 # The catalog holds the truth, so Prefect neither caches nor persists results.
 OPTIONS: dict[str, Any] = {
@@ -44,7 +49,9 @@ def extract_features(job: Job) -> dict[str, Any]:
 @task(name="train-tile", task_run_name="train {job.tile_id}", tags=["gpu"], **OPTIONS)
 def train_tile(job: Job) -> dict[str, Any]:
     """Train and evaluate one tile's field."""
-    return _work("train", job)
+    trained = _work("train", job)
+    job.opened_workspace.catalog().progress(job.build_id, QUEUED)  # until its extraction has its turn
+    return trained
 
 
 @task(name="extract-tile", task_run_name="extract {job.tile_id}", tags=["gpu"], **OPTIONS)
@@ -54,11 +61,23 @@ def extract_tile(job: Job) -> dict[str, Any]:
 
 
 def _work(command: str, job: Job) -> dict[str, Any]:
-    """Run a job and let the catalog know how far it is."""
+    """Run a job and let the catalog know how far it is, and how many workers died at it before."""
     catalog = job.opened_workspace.catalog()
+    given_up = BuildError(f"{command}: somebody ended build {job.build_id} in the catalog; its work is given up")
+    row = next((build for build in catalog.running(job.city) if build.build_id == job.build_id), None)
+    if row is None:
+        raise given_up
+    lost = _lost_workers(row)
 
     def report(progress: Progress) -> None:
-        if not catalog.progress(job.build_id, progress):
-            raise BuildError(f"{command}: somebody ended build {job.build_id} in the catalog; its work is given up")
+        if not catalog.progress(job.build_id, replace(progress, figures={**progress.figures, **lost})):
+            raise given_up
 
-    return run_job(command, job, Pace(report))
+    return {**run_job(command, job, Pace(report)), **lost}
+
+
+def _lost_workers(row: Build) -> dict[str, float]:
+    """Their number, if there are any: a tile's row that nobody works on has no stage."""
+    if row.tile_id == CITY_ROW or row.stage == QUEUED.stage:
+        return {}
+    return {"lost_workers": row.figures.get("lost_workers", 0) + 1}

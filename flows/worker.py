@@ -25,6 +25,7 @@ from presight_core.drives import FrameTable
 from presight_core.errors import PresightError
 from presight_core.pixels import PixelSource
 from presight_core.progress import Progress
+from presight_core.recipes import WARM_START
 
 REPORT_SECONDS = 0.5  # a person sees it move; the catalog is not flooded
 
@@ -66,8 +67,10 @@ def train(job: Job) -> dict[str, Any]:
     training, source = _training(job)
     result = train_tile(training, source, job.scratch, say)
     field = load_field(result.folder, training.device)
-    metrics = {**result.metrics, **evaluate_tile(training, field, source, job.scratch / "pictures", say)}
-    return _record(record, {"folder": str(result.folder), "metrics": {**metrics, "seconds": _since(started)}})
+    evaluation = evaluate_tile(training, field, source, job.scratch / "pictures", say)
+    metrics = {**result.metrics, **evaluation.metrics, "seconds": _since(started)}
+    trained = {"folder": str(result.folder), "metrics": metrics, "drive_psnr_db": evaluation.drive_psnr_db}
+    return _record(record, trained)
 
 
 def extract(job: Job) -> dict[str, Any]:
@@ -111,6 +114,7 @@ def fit_space(job: Job) -> dict[str, Any]:
 
 def _training(job: Job) -> tuple[Any, PixelSource]:
     """The tile's training job and where its pixels come from."""
+    from presight_core.field.files import read_sub_fields
     from stages.tiling import sub_fields
     from stages.training import TileTraining
     from storage.pixels import CachedPixels
@@ -121,8 +125,21 @@ def _training(job: Job) -> tuple[Any, PixelSource]:
     cache = workspace.features()
     source = CachedPixels(frames, roots, cache, job.features_key, settings)
     channels = workspace.artifacts().space(job.space_id).channel_count
-    fields = sub_fields(frames.positions, settings.tiling)
-    return TileTraining(job.tile_id, frames, fields, settings, channels, job.threads, job.device), source
+    start, steps = _start(job)
+    fields = read_sub_fields(start.folder) if start else sub_fields(frames.positions, settings.tiling)
+    settings = settings.model_copy(update={"training": settings.training.model_copy(update={"steps": steps})})
+    return TileTraining(job.tile_id, frames, fields, settings, channels, job.threads, job.device, start), source
+
+
+def _start(job: Job) -> tuple[Any, int]:
+    """The field that the training goes on from, if any, and its steps."""
+    from stages.warm_start import FieldStart
+
+    begun = job.training_recipe["inputs"].get(WARM_START)
+    if begun is None:
+        return None, job.opened_settings.training.steps
+    folder = job.opened_workspace.scratch(job.city, job.tile_id, begun["training"]) / "field"
+    return FieldStart(folder, begun["training"], tuple(begun["drives"])), begun["steps"]
 
 
 def _readable(job: Job, frames: FrameTable) -> NDArray[np.int64]:

@@ -155,11 +155,24 @@ class ExtractionSettings(Settings):
 
 
 class ValidationSettings(Settings):
-    """What a new tile must show before it may be published."""
+    """What a new tile must show before it may be published: by itself, then against the tile that it replaces.
+
+    Both builds are compared where both saw: by the voxels of the drives that both have.
+    """
 
     min_voxels: Count = 100
     min_psnr_db: float = 12.0  # held-out; below this the field shows nothing recognisable
     min_coverage: Share = 0.8  # share of the old tile's observed columns that the new one must keep
+    min_geometry: Share = 0.6  # share of the voxels that lie within one voxel of the other build's, both ways
+    min_feature_cosine: Annotated[float, Field(ge=-1, le=1)] = 0.6  # of centred features of common voxels, the median
+    max_psnr_loss_db: Annotated[float, Field(ge=0)] = 1.5  # held-out, of the drives that both builds have
+
+
+class UpdateSettings(Settings):
+    """When and for how long `presight update` trains a tile on from the field that it has."""
+
+    warm_steps_share: Share = 0.4  # of training.steps; 0: always from nothing
+    max_outside: Share = 0.1  # of the cameras, outside the boxes of the field: there its grids are coarse
 
 
 class SplitSettings(Settings):
@@ -175,6 +188,14 @@ class SplitSettings(Settings):
     allow_overlap: bool = False  # of the ground of train and test drives
 
 
+class ResourceSettings(Settings):
+    """What a tile asks of the cluster that builds it (`--runner dask`); it changes no prior."""
+
+    cores: Count = 4
+    gpus: Annotated[int, Field(ge=0, le=1)] = 1
+    memory_gib: Annotated[float, Field(gt=0)] = 8.0  # a training of 40,000 images takes 3.4 GiB, its extraction less
+
+
 class CitySettings(Settings):
     """Everything that decides a city's priors."""
 
@@ -187,6 +208,8 @@ class CitySettings(Settings):
     training: TrainingSettings = TrainingSettings()
     extraction: ExtractionSettings = ExtractionSettings()
     validation: ValidationSettings = ValidationSettings()
+    update: UpdateSettings = UpdateSettings()
+    resources: ResourceSettings = ResourceSettings()
 
 
 class WorkspaceSettings(Settings):

@@ -9,6 +9,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+WARM_START = "warm_start"  # an input: the field that a training began with, instead of random numbers
 DIGEST_LENGTH = 16  # hex digits, 64 bits: collisions are out of reach for millions of artifacts
 
 
@@ -29,6 +30,16 @@ class Recipe:
     def to_json(self) -> dict[str, Any]:
         """The recipe as JSON values."""
         return {"stage": self.stage, "version": self.version, "settings": self.settings, "inputs": self.inputs}
+
+
+def aim_of(value: Any) -> Any:
+    """A recipe's JSON without what its parts were begun with: what it is to be, not how it got there.
+
+    Equal aims are equally current; the digest of the whole recipe names the artifact.
+    """
+    if not isinstance(value, dict):
+        return value
+    return {name: aim_of(part) for name, part in value.items() if name != WARM_START}
 
 
 def canonical_json(value: Any) -> str:

@@ -24,10 +24,18 @@ CHUNK_RAYS = 8192
 COLUMNS = ("real", "rendered", "depth", "real feature", "rendered feature")
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures of a tile's held-out frames; empty where none are held out."""
+
+    metrics: dict[str, float]  # means over images
+    drive_psnr_db: dict[str, float]  # mean psnr_db of each drive's images, by drive id
+
+
 def evaluate_tile(
     job: TileTraining, field: TileField, source: PixelSource, pictures_folder: Path, report: Report = silent
-) -> dict[str, float]:
-    """Figures of the held-out frames, and `rows.png` with three of them; empty where none are held out.
+) -> Evaluation:
+    """Figures of the held-out frames, and `rows.png` with three of them.
 
     psnr_db is the mean over images, over pixels that show nothing dynamic, at the mean of all embeddings;
     psnr_own_video_db uses the embedding of the image's own drive. feature_rmse is in units of the feature
@@ -47,8 +55,15 @@ def evaluate_tile(
         pictures_folder.mkdir(parents=True, exist_ok=True)
         pictures.save_png(pictures_folder / "rows.png", pictures.stack_rows(picture_rows, COLUMNS))
     report(Progress("evaluation", len(rows), len(rows)))
+    psnr_db: dict[str, list[float]] = {}
+    for drive_id, figures in zip(job.frames.drive_id[rows].tolist(), table, strict=True):
+        if "psnr_db" in figures:
+            psnr_db.setdefault(drive_id, []).append(figures["psnr_db"])
     names = sorted({name for figures in table for name in figures})
-    return {name: float(np.mean([figures[name] for figures in table if name in figures])) for name in names}
+    return Evaluation(
+        {name: float(np.mean([figures[name] for figures in table if name in figures])) for name in names},
+        {drive_id: float(np.mean(values)) for drive_id, values in psnr_db.items()},
+    )
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from stages.card_pool import Targets
 from stages.feeding import Feed
 from stages.ground import Ground
 from stages.ray_pool import PixelBatch
+from stages.warm_start import FieldStart, go_on_from
 
 REPORT_SECONDS = 0.5
 PULSE_WIDTHS = (0.03, 0.003)  # of the blurred interlevel loss, coarse proposal first (released code)
@@ -48,6 +49,7 @@ class TileTraining:
     feature_channels: int
     threads: int = 1
     device: str = "cpu"
+    start: FieldStart | None = None  # a field of the same sub-fields to go on from; None: random numbers
 
     @property
     def recipe(self) -> Recipe:
@@ -62,6 +64,8 @@ class TileTraining:
             "feature_channels": self.feature_channels,
             "dynamic_classes": list(self.settings.features.dynamic_classes),
         }
+        if self.start:
+            inputs["start"] = self.start.name
         settings = {name: getattr(self.settings, name).model_dump(mode="json") for name in chosen}
         return Recipe("training", versions.TRAINING, settings, inputs)
 
@@ -182,6 +186,8 @@ class Run:
         self._file = scratch / "training.safetensors"
         self._videos, self._images = video_numbers(job.frames), image_numbers(job.frames, self._settings)
         self.field = _new_field(job, int(self._videos.max()) + 1, int(self._images.max()) + 1)
+        if job.start:
+            go_on_from(job.start, self.field, job.frames, self._images)
         self._names = {id(parameter): name for name, parameter in self.field.named_parameters()}
         is_table = {id(parameter): name.endswith("grid.table") for name, parameter in self.field.named_parameters()}
         tables = [parameter for parameter in self.field.parameters() if is_table[id(parameter)]]

@@ -245,8 +245,8 @@ class Catalog:
             values = {"build_id": build_id, "state": state, "metrics": encoded, "error": error}
             now = finished_at or self._now()
             ended = query(FINISH_BUILD, **values, now=now)
-            for build in ended:
-                record_end(query, build, json.loads(build["metrics"]), now)
+            for row in ended:
+                record_end(query, {**row, "recipe": json.loads(row["recipe"])}, json.loads(row["metrics"]), now)
             if not ended:
                 if query("SELECT 1 FROM builds WHERE build_id = :build_id", build_id=build_id):
                     raise ConflictError(f"build {build_id} was ended before, as failed; run `presight build` again")
@@ -348,7 +348,7 @@ FINISH_BUILD = """
     UPDATE builds SET state = :state, metrics = COALESCE(:metrics, metrics), error = :error, updated_at = :now,
                       finished_at = :now
     WHERE build_id = :build_id AND state <> 'failed'
-    RETURNING city, tile_id, state, error, metrics, recipe_digest"""
+    RETURNING city, tile_id, state, error, metrics, recipe"""
 WITHDRAW = """
     UPDATE builds SET state = 'withdrawn', updated_at = :now
     WHERE city = :city AND tile_id = :tile_id AND state = 'published'"""

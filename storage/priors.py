@@ -26,7 +26,7 @@ from presight_core.priors.documents import (
 from presight_core.priors.location import ReadLocation
 from presight_core.priors.reader import PriorReader, generation_numbers, read_city, read_generation, read_tag
 from presight_core.priors.schema import FEATURE_STEP, VoxelBatch
-from presight_core.priors.summary import TileSummary
+from presight_core.priors.tile_table import TileTable
 from storage.location import exists, open_store, put_once, remove, size_bytes
 from storage.tile_groups import TileName, write_group
 
@@ -188,12 +188,11 @@ class PriorStore:
             raise ConflictError(f"{city}: generation {new.number} came first; look at it, then run it again")
         return new.number
 
-    def summary(self, city: str, tile: GenerationTile) -> TileSummary:
-        """The extent of a written build, published or not."""
+    def table(self, city: str, tile: GenerationTile) -> TileTable:
+        """The table of a written build, published or not."""
         facts = self.city(city)
         tiles = {"tile": tile}
-        table = PriorReader(self.location, facts, Generation(0, None, city, facts.space_id, {}, tiles)).tile("tile")
-        return TileSummary(tile.entry.voxel_count, table.block_index, table.observed)
+        return PriorReader(self.location, facts, Generation(0, None, city, facts.space_id, {}, tiles)).tile("tile")
 
     def size_bytes(self, city: str) -> int:
         """Bytes of everything the store keeps of a city: all builds and generations."""

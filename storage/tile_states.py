@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from presight_core.recipes import aim_of, digest_of
 from storage.database import Database, Query
 
 CITY_ROW = "all tiles"  # the row of work that belongs to no tile: the feature space and the features
@@ -132,13 +133,13 @@ def record_progress(query: Query, build: Mapping[str, Any], values: Mapping[str,
 
 
 def record_end(query: Query, build: Mapping[str, Any], metrics: Mapping[str, Any], now: str) -> None:
-    """A build ended; `build`: city, tile_id, state, error, recipe_digest."""
+    """A build ended; `build`: city, tile_id, state, error, and recipe as JSON values."""
     place = {"city": build["city"], "tile_id": build["tile_id"], "now": now}
     first_line = build["error"].splitlines()[0] if build["error"] else ""
     query(END, **place, state=build["state"], error=first_line)
     if build["state"] == "published":
         shown = {name: metrics.get(name) for name in ("voxels", "psnr_db", "generation")}
-        query(PUBLISH, **place, **shown, digest=build["recipe_digest"])
+        query(PUBLISH, **place, **shown, digest=digest_of(aim_of(build["recipe"])))  # a plan knows no more
 
 
 def record_withdrawal(query: Query, city: str, tile_id: str, now: str) -> None:

@@ -1,19 +1,21 @@
-"""Real servers for the tests: PostgreSQL and an S3 store, from wheels, on loopback only, ended by their number."""
+"""Real servers for the tests: PostgreSQL, an S3 store, Prefect: from wheels, on loopback, ended by their number."""
 
 import os
 import pwd
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
-START_S = 60  # a busy machine may take long to start a server; a broken one is given up then
+START_S = 120  # a busy machine may take long to start a server; a broken one is given up then
 S3_BUCKET = "presight"
 S3_SECRETS = {"AWS_ACCESS_KEY_ID": "presight", "AWS_SECRET_ACCESS_KEY": "only-for-tests"}
 
@@ -55,9 +57,9 @@ def postgres_server() -> Iterator[str]:
 def s3_server() -> Iterator[dict[str, str]]:
     """A new SeaweedFS with the bucket `presight` on loopback; the environment that reaches it as s3://presight/."""
     program = Path(sys.executable).parent / "weed"
-    ports = dict(zip(("master", "volume", "filer", "s3", "admin"), _free_ports(10), strict=False))
+    ports = dict(zip(("master", "volume", "filer", "s3", "admin"), free_ports(10), strict=False))
     options = [f"-{name}.port={port}" for name, port in ports.items()]
-    options += [f"-{name}.port.grpc={port}" for name, port in zip(ports, _free_ports(10)[5:], strict=True)]
+    options += [f"-{name}.port.grpc={port}" for name, port in zip(ports, free_ports(10)[5:], strict=True)]
     off = ["-admin.ui=false", "-webdav=false", "-master.telemetry=false", "-s3.port.iceberg=0", "-s3.port.lance=0"]
     with tempfile.TemporaryDirectory(prefix="presight-s3-") as folder:
         place = [f"-dir={folder}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1", f"-bucket={S3_BUCKET}"]
@@ -81,6 +83,63 @@ def s3_server() -> Iterator[dict[str, str]]:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+class PrefectServer:
+    """A Prefect server on loopback, one process, all of it in one folder; it may be killed and come back."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, (self._port,) = folder, free_ports(1)
+        self.url = f"http://127.0.0.1:{self._port}/api"
+        self.environment = {
+            "PREFECT_API_URL": self.url,
+            "PREFECT_HOME": str(folder),
+            "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+            "DO_NOT_TRACK": "1",
+            "PREFECT_WORKER_QUERY_SECONDS": "1",
+        }
+        self._process: subprocess.Popen | None = None
+
+    def start(self) -> None:
+        """Start it, and wait until it answers."""
+        quick = {"SERVER_UI_ENABLED": "false", "SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2"}
+        quick["SERVER_DEPLOYMENTS_CONCURRENCY_SLOT_WAIT_SECONDS"] = "5"  # SQLite does not take more questions well
+        environment = {**os.environ, **self.environment, **{f"PREFECT_{name}": text for name, text in quick.items()}}
+        app = ["--factory", "prefect.server.api.server:create_app", "--host", "127.0.0.1", "--port", str(self._port)]
+        command = [sys.executable, "-m", "uvicorn", *app, "--timeout-graceful-shutdown", "5"]
+        with (self._folder / "server.log").open("ab") as log:
+            self._process = subprocess.Popen(command, cwd=self._folder, env=environment, stdout=log, stderr=log)
+        _wait_until(self._is_healthy, self._process)
+
+    def end(self, number: int = signal.SIGTERM) -> None:
+        """End it by a signal, if it runs."""
+        if self._process is None:
+            return
+        self._process.send_signal(number)
+        try:
+            self._process.wait(15)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process = None
+
+    def _is_healthy(self) -> bool:
+        try:
+            with urllib.request.urlopen(f"{self.url}/health", timeout=5) as answer:
+                return answer.status == 200
+        except OSError:
+            return False
+
+
+@contextmanager
+def prefect_server(folder: Path) -> Iterator[PrefectServer]:
+    """A running Prefect server that keeps its database in `folder`."""
+    server = PrefectServer(folder)
+    try:
+        server.start()
+        yield server
+    finally:
+        server.end()
 
 
 def _unprivileged(folder: Path) -> dict[str, int]:
@@ -110,7 +169,7 @@ def _has_bucket(port: int, log: Path) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0 and b"Press Ctrl+C" in log.read_bytes()
 
 
-def _free_ports(count: int) -> list[int]:
+def free_ports(count: int) -> list[int]:
     sockets = [socket.socket() for _ in range(count)]
     for each in sockets:
         each.bind(("127.0.0.1", 0))

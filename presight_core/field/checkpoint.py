@@ -1,7 +1,7 @@
 """Fields and training states on disk: safetensors, each file replaced in one step.
 
 A safetensors header holds the JSON that describes the tensors, so one rename commits both. The `.json`
-beside a field is a copy for people.
+beside a field is a copy for people and for plans.
 """
 
 import json
@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from presight_core.errors import InputError, NotFoundError
+from presight_core.field.files import FIELD_FILE, SHAPE_FILE
 from presight_core.field.tile_field import FieldShape, TileField
 
-FIELD_FILE = "field.safetensors"
 TYPE_NAMES = {torch.float32: "F32", torch.int64: "I64"}  # parameters and optimisers hold no others
 FIELD_VERSION = 1  # of the parameters' names and meaning
 
@@ -27,7 +27,7 @@ def save_field(folder: Path, field: TileField) -> None:
     """Write a field's parameters and shape into a folder, made if need be."""
     header = {"version": FIELD_VERSION, "shape": field.shape.to_json()}
     save_tensors(folder / FIELD_FILE, dict(field.state_dict()), header)
-    _replace(folder / "field.json", lambda file: file.write_text(json.dumps(header, indent=2), encoding="utf-8"))
+    _replace(folder / SHAPE_FILE, lambda file: file.write_text(json.dumps(header, indent=2), encoding="utf-8"))
 
 
 def load_field(folder: Path, device: str = "cpu") -> TileField:

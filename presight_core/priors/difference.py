@@ -26,8 +26,8 @@ class TileDifference:
 
 def tile_difference(old: TileTable | None, new: TileTable | None) -> TileDifference:
     """What changed from one build of a tile to another; None for a tile that is not there."""
-    before, after = _voxels(old), _voxels(new)
-    keys_before, keys_after = _keys(before), _keys(after)
+    before, after = lattice_voxels(old), lattice_voxels(new)
+    keys_before, keys_after = voxel_keys(before), voxel_keys(after)
     _, there, here = np.intersect1d(keys_before, keys_after, assume_unique=True, return_indices=True)
     differs = np.zeros(len(there), np.bool_)
     if old is not None and new is not None:
@@ -42,14 +42,15 @@ def tile_difference(old: TileTable | None, new: TileTable | None) -> TileDiffere
     )
 
 
-def _voxels(table: TileTable | None) -> NDArray[np.int64]:
+def lattice_voxels(table: TileTable | None) -> NDArray[np.int64]:
+    """The lattice voxels (N, 3) of a build, in the order of its rows; none for None."""
     if table is None:
         return np.zeros((0, 3), np.int64)
     blocks = np.repeat(table.block_index, np.diff(table.block_start), axis=0)
     return unpack_voxels(table.all_rows("voxel"), blocks, table.lattice)
 
 
-def _keys(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One number for each voxel."""
+def voxel_keys(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each lattice voxel (N, 3)."""
     x, y, z = (voxels + np.array([OFFSET, OFFSET, 1 << (HEIGHT_BITS - 1)])).T
     return (x << COLUMN_BITS | y) << HEIGHT_BITS | z

@@ -107,7 +107,7 @@ class TileTable:
         points_ego, inside = box.inside(points_world)
         rows = self.rows_of(places)
         if not set(self.drives).isdisjoint(without_drives):
-            inside &= self._seen_by_others(rows, without_drives)
+            inside &= self.seen_by_others(rows, without_drives)
         kept = np.flatnonzero(inside)
         columns = self.columns(LOOK_ARRAYS, rows[kept])
         columns["points_world"] = np.take(points_world.T, kept, axis=1).T
@@ -158,6 +158,13 @@ class TileTable:
         self._points(self._spans(places))
         rows, size_of = self.rows_of(places), {name: self.arrays[name].spec.chunk_rows for name in LOOK_ARRAYS}
         self.load([(name, piece.chunk) for name, size in size_of.items() for piece in _pieces(rows, size)])
+
+    def seen_by_others(self, rows: NDArray[np.int64], without_drives: Collection[str]) -> NDArray[np.bool_]:
+        """Which of the given ascending rows some other drive than these saw."""
+        count = len(self.drives)
+        others = [drive_bits(bit, count) for bit, drive in enumerate(self.drives) if drive not in without_drives]
+        kept = np.bitwise_or.reduce([np.zeros(word_count(count), np.uint32), *others])
+        return (self.rows("drives", rows) & kept).any(-1)
 
     def _gather(self, name: str, count: int, pieces: list["_Piece"], chunks: Chunks) -> NDArray:
         spec = self.arrays[name].spec
@@ -216,12 +223,6 @@ class TileTable:
         points[:2] += np.repeat(corners + step_m / 2, counts, axis=0).T
         points[2] += self.lattice.origin_m[2] - HEIGHT_OFFSET * self.lattice.voxel_m + step_m / 2
         return points
-
-    def _seen_by_others(self, rows: NDArray[np.int64], without_drives: Collection[str]) -> NDArray[np.bool_]:
-        count = len(self.drives)
-        others = [drive_bits(bit, count) for bit, drive in enumerate(self.drives) if drive not in without_drives]
-        kept = np.bitwise_or.reduce([np.zeros(word_count(count), np.uint32), *others])
-        return (self.rows("drives", rows) & kept).any(-1)
 
 
 def read_group(source: ReadLocation, city: CityDocument, tile: GenerationTile) -> Mapping[str, Any]:

@@ -4,12 +4,14 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tests.flows.scheduler import Scheduler
+from tests.servers import prefect_server
 from tests.torture.toy_city import ToyCity
 
 Presight = Callable[..., subprocess.CompletedProcess[str]]
@@ -18,9 +20,10 @@ Presight = Callable[..., subprocess.CompletedProcess[str]]
 @pytest.fixture(scope="session")
 def presight(tmp_path_factory) -> Presight:
     """Runs the command in a workspace and gives its result; what Prefect keeps goes to a temporary folder."""
-    environment = {**os.environ, "PREFECT_HOME": str(tmp_path_factory.mktemp("prefect"))}
+    home = tmp_path_factory.mktemp("prefect")
 
     def run(workspace: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+        environment = {**os.environ, "PREFECT_HOME": str(home)}
         command = [sys.executable, "-m", "flows.cli", "--workspace", workspace, *arguments]
         text = [str(part) for part in command]
         return subprocess.run(text, capture_output=True, text=True, check=False, env=environment)
@@ -43,3 +46,31 @@ def city_template(tmp_path_factory) -> ToyCity:
 def city(city_template: ToyCity, tmp_path: Path) -> ToyCity:
     """A copy of the city that a test may change."""
     return replace(city_template, root=Path(shutil.copytree(city_template.root, tmp_path / "workspace")))
+
+
+@pytest.fixture(scope="session")
+def new_city_template(tmp_path_factory) -> ToyCity:
+    """A city of two drives that was never built."""
+    folder = tmp_path_factory.mktemp("new-city")
+    made = ToyCity(folder / "workspace", folder / "data", side_blocks=2)
+    made.prepare()
+    made.ingest()
+    return made
+
+
+@pytest.fixture
+def new_city(new_city_template: ToyCity, tmp_path: Path) -> ToyCity:
+    """A copy of the city that a test may build."""
+    return replace(new_city_template, root=Path(shutil.copytree(new_city_template.root, tmp_path / "workspace")))
+
+
+@pytest.fixture(scope="session")
+def scheduler(tmp_path_factory) -> Iterator[Scheduler]:
+    """A real Prefect server; a worker starts with the first test that needs one."""
+    folder = tmp_path_factory.mktemp("prefect")
+    with prefect_server(folder) as server:
+        made = Scheduler(server, folder)
+        try:
+            yield made
+        finally:
+            made.end_worker()

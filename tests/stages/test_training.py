@@ -3,61 +3,15 @@ import pytest
 import torch
 
 from presight_core import classes
-from presight_core.drives import FrameTable
 from presight_core.errors import BuildError, InputError
 from presight_core.field.checkpoint import load_field
-from presight_core.frames import planar_transform
 from presight_core.pixels import FramePixels
 from presight_core.progress import Progress
-from presight_core.tiles import SubField
 from stages import feeding
-from stages.evaluation import evaluate_tile
+from stages.evaluation import Evaluation, evaluate_tile
 from stages.ray_pool import RayPool, draw_static
-from stages.training import TileTraining, holdout_mask, image_numbers, train_tile, training_rows
-from tests.stages.small_training import tiny_settings
-
-EGO_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
-SIZE = (24, 16)
-
-
-class Gradient:
-    """Images whose upper half is sky, whose lower half is road, and whose left column is a car."""
-
-    def load(self, row: int) -> FramePixels:
-        width, height = SIZE
-        rgb = np.zeros((height, width, 3), np.uint8)
-        rgb[: height // 2] = (90, 140, 230)
-        rgb[height // 2 :] = 70 + row
-        labels = np.full((height // 2, width // 2), 0, np.uint8)
-        labels[: height // 4] = classes.SKY
-        labels[:, 0] = classes.CITYSCAPES.index("car")
-        features = np.zeros((height // 4, width // 4, 3), np.uint8)
-        features[height // 8 :] = 255
-        return FramePixels(rgb, labels, features)
-
-
-def street(count: int = 8, drives: int = 1) -> FrameTable:
-    poses = np.stack([planar_transform(x, 0, 0) @ EGO_FROM_CAMERA for x in np.linspace(0, 10, count)])
-    return FrameTable(
-        drive_id=np.array([f"drive{i * drives // count}" for i in range(count)]),
-        camera=np.full(count, "CAM_FRONT"),
-        timestamp_us=np.arange(count) * 500_000,
-        path=np.array([f"{i}.jpg" for i in range(count)]),
-        file_bytes=np.ones(count, np.int64),
-        width_px=np.full(count, 48, np.int32),  # twice the working resolution
-        height_px=np.full(count, 32, np.int32),
-        intrinsics=np.tile(np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), (count, 1, 1)),
-        world_from_camera=poses,
-        is_keyframe=np.arange(count) % 2 == 0,
-    )
-
-
-def tiny_job(*overrides: str, frames: FrameTable | None = None) -> TileTraining:
-    halves = (
-        SubField((2.5, 0, 1.5), (-15, -15, -4), (20, 15, 16)),
-        SubField((7.5, 0, 1.5), (-10, -15, -4), (25, 15, 16)),
-    )
-    return TileTraining("t000", street() if frames is None else frames, halves, tiny_settings(*overrides), 3)
+from stages.training import holdout_mask, image_numbers, train_tile, training_rows
+from tests.stages.small_training import Gradient, street, tiny_job, tiny_settings
 
 
 def parameters_of(folder) -> dict[str, torch.Tensor]:
@@ -212,16 +166,18 @@ def test_pools_that_do_not_fit_take_turns(tmp_path, monkeypatch):
 def test_evaluation_reports_the_held_out_frames_and_draws_them(tmp_path):
     job = tiny_job("training.steps=30")
     field = load_field(train_tile(job, Gradient(), tmp_path).folder)
-    figures = evaluate_tile(job, field, Gradient(), tmp_path / "pictures")
+    evaluation = evaluate_tile(job, field, Gradient(), tmp_path / "pictures")
+    figures = evaluation.metrics
     assert set(figures) == {"psnr_db", "psnr_own_video_db", "feature_rmse", "found_share", "sky_share"}
     assert figures["psnr_db"] > 10
+    assert evaluation.drive_psnr_db == {"drive0": pytest.approx(figures["psnr_db"])}
     assert (tmp_path / "pictures" / "rows.png").stat().st_size > 0
 
 
 def test_evaluation_without_held_out_frames_is_empty(tmp_path):
     job = tiny_job("training.holdout_every=0", "training.steps=1")
     field = load_field(train_tile(job, Gradient(), tmp_path).folder)
-    assert evaluate_tile(job, field, Gradient(), tmp_path / "pictures") == {}
+    assert evaluate_tile(job, field, Gradient(), tmp_path / "pictures") == Evaluation({}, {})
 
 
 def test_an_image_that_cannot_be_read_stops_the_training(tmp_path, monkeypatch):

@@ -2,54 +2,66 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from presight_core.config import ValidationSettings
-from presight_core.priors.schema import pack_columns
-from presight_core.priors.summary import TileSummary
-from stages.validation import validate_tile
+from presight_core.priors.agreement import Agreement
+from stages.validation import judge_build, judge_change, psnr_change_db
 
-SETTINGS = ValidationSettings(min_voxels=100, min_psnr_db=12.0, min_coverage=0.8)
+SETTINGS = ValidationSettings(
+    min_voxels=100, min_psnr_db=12.0, min_coverage=0.8, min_geometry=0.6, min_feature_cosine=0.5, max_psnr_loss_db=1.0
+)
 GOOD = {"psnr_db": 24.0, "loss": 0.01}
-
-
-def summary(observed_rows: int, voxel_count: int = 1000) -> TileSummary:
-    """One block of which so many rows of columns were observed."""
-    observed = np.zeros((1, 32, 32), np.bool_)
-    observed[0, :observed_rows] = True
-    return TileSummary(voxel_count, np.zeros((1, 2), np.int32), pack_columns(observed))
+ALIKE = Agreement(coverage=0.8, old_found=0.7, new_found=0.6, feature_cosine=0.5)
 
 
 def test_a_good_first_tile_may_be_published():
-    assert validate_tile(summary(10), GOOD, None, SETTINGS) == ()
+    assert judge_build(100, GOOD, SETTINGS) == ()
+    assert judge_change(None, None, SETTINGS) == ()
 
 
 def test_a_tile_without_held_out_frames_is_judged_by_the_rest():
-    assert validate_tile(summary(10), {"loss": 0.01}, None, SETTINGS) == ()
+    assert judge_build(100, {"loss": 0.01}, SETTINGS) == ()
 
 
 @pytest.mark.parametrize(
-    ("new", "metrics", "fact"),
+    ("voxels", "metrics", "fact"),
     [
-        (summary(10, voxel_count=99), GOOD, "99 voxels"),
-        (summary(10), {"psnr_db": 11.9}, "11.9 dB"),
-        (summary(10), {"psnr_db": float("nan")}, "not a number: psnr_db"),
-        (summary(10), {**GOOD, "loss": float("inf")}, "not a number: loss"),
-        (summary(7), GOOD, "70% of the observed columns"),
+        (99, GOOD, "99 voxels"),
+        (100, {"psnr_db": 11.9}, "11.9 dB"),
+        (100, {"psnr_db": float("nan")}, "not a number: psnr_db"),
+        (100, {**GOOD, "loss": float("inf")}, "not a number: loss"),
     ],
-    ids=["few voxels", "poor images", "psnr is nan", "loss is infinite", "lost ground"],
+    ids=["few voxels", "poor images", "psnr is nan", "loss is infinite"],
 )
-def test_each_fault_is_one_problem(new: TileSummary, metrics: dict, fact: str):
-    (problem,) = validate_tile(new, metrics, summary(10), SETTINGS)
+def test_each_fault_of_a_build_is_one_problem(voxels: int, metrics: dict, fact: str):
+    (problem,) = judge_build(voxels, metrics, SETTINGS)
     assert fact in problem
 
 
-def test_losing_a_fifth_of_the_ground_is_still_allowed():
-    assert validate_tile(summary(8), GOOD, summary(10), SETTINGS) == ()
+def test_a_build_like_the_old_one_may_replace_it():
+    assert judge_change(ALIKE, -1.0, SETTINGS) == ()
 
 
-def test_new_ground_does_not_make_up_for_lost_ground():
-    larger_elsewhere = replace(summary(32), block_index=np.array([[5, 5]], np.int32))
-    (problem,) = validate_tile(larger_elsewhere, GOOD, summary(10), SETTINGS)
-    assert "0% of the observed columns" in problem
+@pytest.mark.parametrize(
+    ("name", "value", "fact"),
+    [
+        ("coverage", 0.7, "keeps 70% of the observed columns"),
+        ("old_found", 0.5, "50% of the old voxels and 60% of the new ones"),
+        ("new_found", 0.5, "70% of the old voxels and 50% of the new ones"),
+        ("feature_cosine", 0.4, "cosine of old and new features 0.40"),
+    ],
+)
+def test_each_difference_from_the_old_build_is_one_problem(name: str, value: float, fact: str):
+    (problem,) = judge_change(replace(ALIKE, **{name: value}), None, SETTINGS)
+    assert fact in problem
+
+
+def test_worse_images_are_a_problem():
+    (problem,) = judge_change(None, -1.1, SETTINGS)
+    assert "1.1 dB worse" in problem
+
+
+def test_images_are_compared_by_the_drives_that_both_builds_have():
+    assert psnr_change_db({"a": 20.0, "b": 22.0, "gone": 5.0}, {"a": 21.0, "b": 21.0, "night": 9.0}) == 0.0
+    assert psnr_change_db({"a": 20.0}, {"b": 20.0}) is None

@@ -263,18 +263,6 @@ def test_size_on_disk_counts_every_file(town):
     assert town.store.size_bytes("town") == sum(file.stat().st_size for file in files)
 
 
-def test_summary_measures_what_a_new_build_keeps(empty_town):
-    old = empty_town.store.summary("town", empty_town.write("t000", "build-1"))
-    same = empty_town.store.summary("town", empty_town.write("t000", "build-2"))
-    smaller = replace(empty_town.example, side_blocks=2)
-    new = empty_town.store.summary("town", empty_town.write("t000", "build-3", smaller))
-    assert same.kept_share(old) == 1
-    # 4 of 16 blocks, each with another random half of its columns
-    assert new.kept_share(old) == pytest.approx(4 / 16 / 2, abs=0.02)
-    assert new.kept_share(new) == 1
-    assert old.observed_columns == pytest.approx(16 * 32 * 32 / 2, rel=0.02)
-
-
 def test_a_store_can_be_a_file_url(tmp_path: Path):
     url = f"file://{tmp_path}/a%20store"
     PriorStore.open(url).create_city("town", Lattice(), "space-1", 8)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from flows.city import freeze, tile_jobs
+from flows.acceptance import Built
+from flows.city import Order, freeze, tile_jobs
 from flows.ingest import ingest_root
 from flows.plan import plan_city, record_plan, space_key
-from flows.publication import Built, publish
+from flows.publication import publish
 from flows.reconcile import hold_city, reconcile
 from presight_core.config import load_city_settings
 from presight_core.feature_space import FeatureSpace
@@ -67,8 +68,14 @@ class ToyCity:
         """Take in the drives."""
         ingest_root(self.root, self.data, VERSION, keep_going=False, as_json=False)
 
-    def build(self, wait: bool = False, overrides: tuple[str, ...] = ()) -> int | None:
-        """Build and publish what is stale, as the flow does; the generation."""
+    def build(
+        self,
+        wait: bool = False,
+        overrides: tuple[str, ...] = (),
+        warm: bool = False,
+        accept: tuple[str, ...] = (),
+    ) -> int | None:
+        """Build and publish what is stale, as the flows do; the generation."""
         workspace = self.workspace
         settings = load_city_settings(workspace.city_file(CITY), overrides)
         reconcile(workspace, CITY)
@@ -79,8 +86,9 @@ class ToyCity:
                 return plan.generation
             if plan.stale:
                 freeze(workspace, plan, lease)
-            built = [self._written(workspace, job) for job in tile_jobs(workspace, plan, 1, ["cpu"], lease).values()]
-            return publish(workspace, plan, built, {}, lease)["generation"]
+            jobs = tile_jobs(workspace, plan, Order(str(self.root), CITY, warm=warm), lease)
+            built = [self._written(workspace, job) for job in jobs.values()]
+            return publish(workspace, plan, built, {}, lease, accept)["generation"]
 
     def example(self, tile_id: str) -> ExampleTile:
         """What the tile holds in truth."""
