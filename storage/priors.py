@@ -173,7 +173,7 @@ class PriorStore:
     def remove_tag(self, city: str, tag: str) -> None:
         """Take a tag away; the generation stays, until it is old. Raises NotFoundError if there is no such tag."""
         read_tag(self._source, city, tag)
-        remove(self._objects, [tag_path(city, tag)])
+        remove(self._objects, tag_path(city, tag))
 
     def rollback(self, city: str, number: int) -> int:
         """Publish a new generation that shows exactly what an earlier one did; its number.
