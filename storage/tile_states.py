@@ -147,6 +147,13 @@ def record_withdrawal(query: Query, city: str, tile_id: str, now: str) -> None:
     query(WITHDRAW, city=city, tile_id=tile_id, now=now)
 
 
+def record_showing(query: Query, build: Mapping[str, Any]) -> None:
+    """The prior shows an earlier build of a tile; `build`: city, tile_id, metrics, recipe_digest, finished_at."""
+    shown = {name: build["metrics"].get(name) for name in ("voxels", "psnr_db", "generation")}
+    place = {"city": build["city"], "tile_id": build["tile_id"]}
+    query(SHOW, **place, **shown, digest=build["recipe_digest"], published_at=build["finished_at"])
+
+
 STATE = """
     CASE WHEN state = 'running' AND stage = '' THEN 'queued' WHEN state = '' THEN 'planned'
     WHEN state = 'published' AND reasons <> '' THEN 'stale' ELSE state END"""
@@ -192,6 +199,11 @@ END = """
 PUBLISH = """
     UPDATE tile_states SET voxels = :voxels, psnr_db = :psnr_db, generation = :generation, published_at = :now,
         reasons = CASE WHEN plan_digest IN ('', :digest) THEN '' ELSE reasons END
+    WHERE city = :city AND tile_id = :tile_id"""
+SHOW = """
+    UPDATE tile_states SET voxels = :voxels, psnr_db = :psnr_db, generation = :generation,
+        published_at = :published_at, state = CASE WHEN state = 'withdrawn' THEN 'published' ELSE state END,
+        reasons = CASE WHEN plan_digest = :digest THEN '' ELSE 'an earlier build is shown again' END
     WHERE city = :city AND tile_id = :tile_id"""
 WITHDRAW = """
     UPDATE tile_states SET state = CASE WHEN state = 'published' THEN 'withdrawn' ELSE state END, voxels = NULL,
