@@ -120,7 +120,7 @@ def test_the_new_drive_is_in_the_prior(updated):
     assert drive.drive_id in PriorReader.open(workspace.store_location, CITY).drive_names
     world_from_ego = np.eye(4)
     world_from_ego[:3, 3] = workspace.drives().frames(drive.drive_id).positions.mean(0)
-    views = {"x_m": (-20, 20), "y_m": (-20, 20), "z_m": (-600, 600)}
+    views = {"x_m": (-2000, 2000), "y_m": (-2000, 2000), "z_m": (-600, 600)}
     reader = PriorReader.open(workspace.store_location, CITY)
     others = [each.drive_id for each in workspace.catalog().drives(CITY) if each != drive]
     assert len(reader.window(world_from_ego, **views, without_drives=others)) > 0
