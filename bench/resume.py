@@ -2,8 +2,8 @@
 
 python -m bench.resume WORKSPACE CITY [SHARE]
 
-WORKSPACE has its drives and settings, and nothing of the city is built; it is copied, and stays as it is. What both
-builds publish must be equal.
+WORKSPACE has its drives and settings, and nothing of the city is built; it is copied, and stays as it is. Both run side
+by side, so that they meet the same load of the machine, and what they publish must be equal.
 """
 
 import shutil
@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from presight_core.field.checkpoint import load_tensors
@@ -64,17 +65,25 @@ def digests(workspace: Path, city: str) -> dict[str, str]:
     return {tile_id: tile.entry.digest for tile_id, tile in generation.tiles.items()}
 
 
+def build_in_parts(workspace: Path, city: str, share: float) -> str:
+    """Build, kill, and build again; what came of it, in words."""
+    first_s, done = build_and_kill(workspace, city, share)
+    saved = saved_steps(workspace, city)
+    second_s = build(workspace, city)
+    lost = {tile_id: step - saved.get(tile_id, 0) for tile_id, step in done.items()}
+    return (
+        f"killed after {first_s:.0f} s with training at step {done}, checkpoints of step {saved}; run again: "
+        f"{second_s:.0f} s; both {first_s + second_s:.0f} s; steps lost {lost}"
+    )
+
+
 def main(source: Path, city: str, share: float = 0.5) -> None:
     """Print both times, and what was lost."""
-    with tempfile.TemporaryDirectory(dir=source.parent) as folder:
+    with tempfile.TemporaryDirectory(dir=source.parent) as folder, ThreadPoolExecutor() as pool:
         whole, parts = (Path(shutil.copytree(source, Path(folder) / name)) for name in ("whole", "parts"))
-        print(f"unbroken: {build(whole, city):.0f} s", flush=True)
-        first_s, done = build_and_kill(parts, city, share)
-        saved = saved_steps(parts, city)
-        print(f"killed after {first_s:.0f} s, training at step {done}, checkpoints of step {saved}", flush=True)
-        second_s = build(parts, city)
-        lost = {tile_id: step - saved.get(tile_id, 0) for tile_id, step in done.items()}
-        print(f"run again: {second_s:.0f} s; both together {first_s + second_s:.0f} s; steps lost {lost}")
+        unbroken, broken = pool.submit(build, whole, city), pool.submit(build_in_parts, parts, city, share)
+        print(f"unbroken: {unbroken.result():.0f} s", flush=True)
+        print(broken.result())
         print(f"equal content: {digests(whole, city) == digests(parts, city)}")
 
 
