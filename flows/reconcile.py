@@ -75,7 +75,7 @@ def end_orphans(workspace: Workspace, city: str, reason: str = RUN_ENDED) -> lis
             finished_at = lineage.get("build", {}).get("finished_at")
             catalog.finish_build(build.build_id, "published", metrics, finished_at=finished_at)
         else:
-            error = f"{reason}; last heard of at {build.updated_at}; run `presight build {city}`"
+            error = f"{reason}; last heard of at {build.updated_at}; run it again, `presight build {city}` or `update`"
             with suppress(ConflictError):  # two may find it at once
                 catalog.finish_build(build.build_id, "failed", None, error)
     return orphans

@@ -164,8 +164,8 @@ class ValidationSettings(Settings):
     min_psnr_db: float = 12.0  # held-out; below this the field shows nothing recognisable
     min_coverage: Share = 0.8  # share of the old tile's observed columns that the new one must keep
     min_geometry: Share = 0.6  # share of the voxels that lie within one voxel of the other build's, both ways
-    min_feature_cosine: Annotated[float, Field(ge=-1, le=1)] = 0.6  # of centred features of common voxels, the median
-    max_psnr_loss_db: Annotated[float, Field(ge=0)] = 1.5  # held-out, of the drives that both builds have
+    min_feature_cosine: Annotated[float, Field(ge=-1, le=1)] = 0.5  # of centred features of common voxels, the median
+    max_psnr_loss_db: Annotated[float, Field(ge=0)] = 2.0  # held-out, of the drives that both builds have
 
 
 class UpdateSettings(Settings):
