@@ -76,14 +76,15 @@ def check_ended(city: ToyCity) -> None:
     assert catalog.running(CITY) == []
     assert catalog.leases.current(CITY) is None
     assert {build.state for build in catalog.builds(CITY) if build.tile_id != "all tiles"} == {"failed"}
-    assert city.workspace.store().generations(CITY) == []
+    assert city.check() == {}, "nothing is shown; whoever ends a lost run may have put a generation that fences it out"
 
 
 def check_next_run(city: ToyCity) -> None:
     """The next run makes the city, and nothing was built twice into it."""
     release(city)
-    assert city.build() == 1
+    city.build()
     city.check_catalog()
+    assert sorted(city.check()) == ["t000", "t001"]
 
 
 def test_a_schedule_builds_the_city_and_its_second_run_waits_and_its_third_does_not_begin(forgetful, new_city):
@@ -137,13 +138,12 @@ def test_a_killed_run_is_ended_in_the_catalog_by_reconcile(deployed, new_city):
     check_next_run(new_city)
 
 
-def test_a_run_outlives_its_killed_worker_and_the_next_worker_builds_nothing_twice(deployed, new_city):
-    run, _ = started(deployed, new_city)
+def test_a_run_whose_worker_is_killed_ends_itself_in_the_catalog(deployed, new_city):
+    started(deployed, new_city)
     deployed.end_worker(signal.SIGKILL)
-    deployed.start_worker()
-    release(new_city)
-    assert deployed.until(run)["type"] == "COMPLETED"
-    check_built_once(new_city)
+    eventually(lambda: not new_city.workspace.catalog().running(CITY))
+    check_ended(new_city)
+    check_next_run(new_city)
 
 
 def test_a_run_outlives_the_killed_server_and_the_next_run_builds_nothing_twice(deployed, new_city):
