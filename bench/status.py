@@ -3,7 +3,6 @@
 python -m bench.status [TILES]
 """
 
-import json
 import statistics
 import sys
 import tempfile
@@ -14,7 +13,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from flows.status import MOST_ROWS, status_of
+from flows.status import MOST_ROWS, current_status, json_line
 from storage.catalog import Catalog
 from storage.leases import text_of
 from tests.servers import postgres_server
@@ -75,7 +74,7 @@ def run(engine: str, url: str, tiles: int) -> None:
     """Measure on one database; every time includes opening the catalog, as a command does."""
 
     def ask(*arguments: Any) -> Callable[[], str]:
-        return lambda: json.dumps(status_of(Catalog.open(url), *arguments))
+        return lambda: json_line(current_status(url, *arguments))
 
     catalog = Catalog.open(url)
     fill(catalog, [f"city-{number:02}" for number in range(CITIES)], tiles)

@@ -59,8 +59,8 @@ def require_split_apart(city: str, index: DriveIndex, known: CityDrives, split: 
     from stages.overlap import overlap, require_apart
 
     train, test = ([drive for drive, part in known.parts.items() if part == role] for role in ("train", "test"))
-    train_world = np.concatenate([index.frames(drive_id).positions for drive_id in train])
-    test_world = {known.names[drive_id]: index.frames(drive_id).positions for drive_id in test}
+    train_world = np.concatenate([index.positions(drive_id)[0] for drive_id in train])
+    test_world = {known.names[drive_id]: index.positions(drive_id)[0] for drive_id in test}
     require_apart(city, overlap(train_world, test_world, split.overlap_m), split.overlap_m)
 
 

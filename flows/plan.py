@@ -25,11 +25,29 @@ from presight_core.recipes import Recipe
 from presight_core.tiles import Tiling
 from stages import tiling, versions
 from storage.catalog import Build
+from storage.drive_positions import DrivePositions, read_positions
 from storage.drives import DriveIndex
 from storage.tile_states import PlannedTile
 from storage.workspace import Workspace
 
 MIN_FRAMES = 8  # fewer images than this cannot constrain a field; the tile is left out and said so
+
+
+@dataclass(frozen=True)
+class Members:
+    """The frames that train one tile, by what a plan must know of them."""
+
+    drive_ids: tuple[str, ...]  # sorted
+    positions: NDArray[np.float64]  # (M, 3) camera centres, world metres
+
+    @staticmethod
+    def of(frames: DrivePositions, rows: NDArray[np.int64]) -> "Members":
+        """The given rows of a city's frames."""
+        drives = np.unique(frames.drive[rows]).tolist()
+        return Members(tuple(sorted(frames.drive_ids[drive] for drive in drives)), frames.positions[rows])
+
+    def __len__(self) -> int:
+        return len(self.positions)
 
 
 @dataclass(frozen=True)
@@ -110,17 +128,16 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
     if not known.builders and generation is None:
         raise _no_drives(workspace, city, known)
     require_split_apart(city, workspace.drives(), known, settings.split)
-    frames = city_frames(workspace.drives(), known.builders, settings) if known.builders else None
+    frames = _positions(workspace, city, known.builders, settings) if known.builders else None
     city_tiling = _tiling(workspace, city, frames, generation, settings)
+    members_of = _members(frames, city_tiling, settings) if frames else []
     space_id = settings.features.space or workspace.artifacts().pinned_space(space_key(settings))
     features = features_recipe(settings, space_id) if space_id else None
     past = {build.tile_id: build for build in catalog.builds(city, "published")}
     compare = partial(stale_reasons, known=known, index=workspace.drives())
     lattice = Lattice()
     tiles, skipped = [], []
-    for index, tile in enumerate(city_tiling.tiles if frames else ()):
-        assert frames is not None
-        members = tile_frames(frames, city_tiling, index, settings)
+    for index, (tile, members) in enumerate(zip(city_tiling.tiles, members_of, strict=False)):
         if len(members) < MIN_FRAMES:
             skipped.append(f"{tile.tile_id}: {len(members)} frames, at least {MIN_FRAMES} are needed")
             continue
@@ -138,7 +155,7 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
             TilePlan(
                 tile=index,
                 tile_id=tile.tile_id,
-                drive_ids=tuple(np.unique(members.drive_id).tolist()),
+                drive_ids=members.drive_ids,
                 frame_count=len(members),
                 training=training,
                 recipe=recipe,
@@ -214,6 +231,18 @@ def tile_frames(frames: FrameTable, city_tiling: Tiling, tile: int, settings: Ci
     return frames.select(city_tiling.within(frames.positions, tile, settings.tiling.overlap_m))
 
 
+def _positions(workspace: Workspace, city: str, drives: tuple[Drive, ...], settings: CitySettings) -> DrivePositions:
+    """Where the cameras were, of all frames that the settings let take part."""
+    found = read_positions(workspace.drives(), city, [drive.drive_id for drive in drives])
+    return found.select(found.is_keyframe) if settings.training.keyframes_only else found
+
+
+def _members(frames: DrivePositions, city_tiling: Tiling, settings: CitySettings) -> list[Members]:
+    """What trains each tile, as `tile_frames` says for one."""
+    tiles = city_tiling.rows_within(frames.positions, settings.tiling.overlap_m)
+    return [Members.of(frames, rows) for rows in tiles]
+
+
 def space_key(settings: CitySettings) -> dict[str, Any]:
     """What decides which feature space is used: the feature model and the number of channels."""
     card = ModelCard.load(settings.features.feature_model, "features")
@@ -234,7 +263,11 @@ def features_recipe(settings: CitySettings, space_id: str) -> Recipe:
 
 
 def _tiling(
-    workspace: Workspace, city: str, frames: FrameTable | None, generation: Generation | None, settings: CitySettings
+    workspace: Workspace,
+    city: str,
+    frames: DrivePositions | None,
+    generation: Generation | None,
+    settings: CitySettings,
 ) -> Tiling:
     """The city's frozen tiling, with new tiles founded on new ground; the first one if there is none."""
     frozen = workspace.catalog().tiling(city)
@@ -255,12 +288,12 @@ def _cut_from(workspace: Workspace, city: str) -> NDArray[np.float64]:
     for record in catalog.drive_records(city):
         if record.added_at <= cut_at:
             with suppress(NotFoundError):  # a removed drive whose index was cleared
-                positions.append(index.frames(record.drive.drive_id).positions)
+                positions.append(index.positions(record.drive.drive_id)[0])
     return np.concatenate(positions)
 
 
 def _recipes(
-    city_tiling: Tiling, tile: int, members: FrameTable, settings: CitySettings, features: Recipe
+    city_tiling: Tiling, tile: int, members: Members, settings: CitySettings, features: Recipe
 ) -> tuple[Recipe, Recipe]:
     """The recipes of a tile's training and of the whole tile."""
     values = settings.model_dump(mode="json")
@@ -268,7 +301,7 @@ def _recipes(
     chosen["training"] = {name: value for name, value in chosen["training"].items() if name != "checkpoint_every"}
     chosen["tiling"] = {name: value for name, value in chosen["tiling"].items() if name not in ("tile_count", "seed")}
     inputs = {
-        "drives": np.unique(members.drive_id).tolist(),
+        "drives": list(members.drive_ids),
         "features": features.to_json(),
         "dynamic_classes": list(settings.features.dynamic_classes),
         "moving": masking.recipe(settings.features),

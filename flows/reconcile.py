@@ -18,8 +18,7 @@ from presight_core.failpoints import failpoint
 from presight_core.priors.documents import Generation
 from storage.catalog import Build, Catalog
 from storage.leases import Lease, LeaseHeldError, LeaseLostError, this_process
-from storage.priors import PriorStore
-from storage.restoration import restore
+from storage.restoration import follow, restore
 from storage.workspace import Workspace
 
 POLL_S = 1.0  # how often a waiting run looks whether the city is free
@@ -43,6 +42,7 @@ def hold_city(workspace: Workspace, city: str, wait: bool = False) -> Iterator[L
         if lease.follows_lost:
             workspace.store().raise_fence(city, lease.token)
         end_orphans(workspace, city)
+        follow(catalog, workspace.store(), city, lease)
         try:
             yield lease
         except StoreError:
@@ -55,6 +55,8 @@ def hold_city(workspace: Workspace, city: str, wait: bool = False) -> Iterator[L
 
 
 def _end(workspace: Workspace, lease: Lease, reason: str) -> None:
+    with suppress(LeaseLostError):  # then the next run does it
+        follow(workspace.catalog(), workspace.store(), lease.city, lease)
     workspace.catalog().leases.end(lease)
     failpoint("lease-ended")
     end_orphans(workspace, lease.city, reason)
@@ -69,11 +71,11 @@ def end_orphans(workspace: Workspace, city: str, reason: str = RUN_ENDED) -> lis
         if _is_shown(head, build):
             assert head is not None
             lineage = head.tiles[build.tile_id].lineage
-            metrics = {**lineage.get("metrics", {}), "generation": _first_showing(store, head, build.tile_id)}
+            metrics = {**lineage.get("metrics", {}), "generation": store.first_showing(head, build.tile_id)}
             finished_at = lineage.get("build", {}).get("finished_at")
             catalog.finish_build(build.build_id, "published", metrics, finished_at=finished_at)
         else:
-            error = f"{reason}; last heard of at {build.updated_at}; run `presight build {city}`"
+            error = f"{reason}; last heard of at {build.updated_at}; run it again, `presight build {city}` or `update`"
             with suppress(ConflictError):  # two may find it at once
                 catalog.finish_build(build.build_id, "failed", None, error)
     return orphans
@@ -152,14 +154,3 @@ def _is_shown(head: Generation | None, build: Build) -> bool:
     """Whether the prior shows the build's recipe: only stale tiles are built, so that it is this build."""
     tile = head.tiles.get(build.tile_id) if head else None
     return tile is not None and recipe_from(tile.recipe).digest == build.recipe_digest
-
-
-def _first_showing(store: PriorStore, head: Generation, tile_id: str) -> int:
-    """The generation that brought what the newest one shows for a tile."""
-    shown, generation = head.tiles[tile_id], head
-    while generation.parent is not None:
-        parent = store.generation(head.city, generation.parent)
-        if parent is None or parent.tiles.get(tile_id) != shown:
-            break
-        generation = parent
-    return generation.number

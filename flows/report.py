@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from flows.jobs import recipe_from
-from flows.plan import city_frames, tile_frames
+from flows.plan import city_frames
 from presight_core.config import CitySettings, load_city_settings
 from presight_core.drives import FrameTable
 from presight_core.maps import prior_picture, tile_map
@@ -60,8 +60,8 @@ def _facts(workspace: Workspace, city: str, reader: PriorReader) -> str:
 
 
 def _tiles(frames: FrameTable, settings: CitySettings, tiling: Tiling, out: Path) -> str:
-    members = [tile_frames(frames, tiling, index, settings) for index in range(len(tiling.tiles))]
-    boxes = [sub_fields(rows.positions, settings.tiling) if len(rows) else () for rows in members]
+    members = tiling.rows_within(frames.positions, settings.tiling.overlap_m)
+    boxes = [sub_fields(frames.positions[rows], settings.tiling) if len(rows) else () for rows in members]
     save_png(out / "tiles.png", tile_map(frames.positions, tiling, boxes))
     return _figure("tiles.png", "Camera positions, tiles and the sub-fields of each tile.")
 

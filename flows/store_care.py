@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.console import print_json, print_table
+from flows.reconcile import hold_city
 from presight_core.errors import SettingsError, StoreError
 from presight_core.priors.documents import Generation, generation_path
 from storage.location import objects, open_store
@@ -85,9 +86,13 @@ def change_tag(folder: Path, city: str, name: str | None, generation: int | None
 
 
 def clean(folder: Path, city: str, retention: Retention, dry_run: bool, as_json: bool) -> None:
-    """Remove what a city no longer needs, or only show it."""
-    store, now = opened(folder, city), datetime.now(UTC)
-    garbage = (find_garbage if dry_run else collect)(store.location, city, retention, now)
+    """Remove what a city no longer needs, or only show it. Raises LeaseHeldError while a run builds the city."""
+    store = opened(folder, city)
+    if dry_run:
+        garbage = find_garbage(store.location, city, retention, datetime.now(UTC))
+    else:
+        with hold_city(Workspace.open(folder), city):  # nobody may publish or show again what goes just now
+            garbage = collect(store.location, city, retention, datetime.now(UTC))
     if as_json:
         print_json({"generations": garbage.generations, "builds": garbage.builds, "bytes": garbage.size_bytes})
         return

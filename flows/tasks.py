@@ -11,6 +11,7 @@ from prefect.cache_policies import NO_CACHE
 
 from flows.jobs import Job
 from flows.launch import WorkerLostError, run_job
+from flows.pace import Pace
 from presight_core.errors import BuildError, ConflictError
 from presight_core.progress import Progress
 from storage.catalog import Build
@@ -72,7 +73,7 @@ def _work(command: str, job: Job) -> dict[str, Any]:
         if not catalog.progress(job.build_id, replace(progress, figures={**progress.figures, **lost})):
             raise given_up
 
-    return {**run_job(command, job, report), **lost}
+    return {**run_job(command, job, Pace(report)), **lost}
 
 
 def _lost_workers(row: Build) -> dict[str, float]:

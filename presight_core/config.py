@@ -129,6 +129,7 @@ class TrainingSettings(Settings):
     weight_decay: float = 1e-5  # not on hash tables
     anneal: Share = 0.1  # share of the steps over which proposal weights sharpen
     thin_weight: Annotated[float, Field(ge=1)] = 1.0  # how much likelier pixels of poles, signs and fences are drawn
+    fade_m: Annotated[float, Field(ge=0)] = 0.0  # nearer than this, gradients fade with the square of the distance
     image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     keyframes_only: bool = False
     holdout_every: Annotated[int, Field(ge=0)] = 8  # every 8th frame of a camera is kept for evaluation; 0: none
@@ -163,8 +164,8 @@ class ValidationSettings(Settings):
     min_psnr_db: float = 12.0  # held-out; below this the field shows nothing recognisable
     min_coverage: Share = 0.8  # share of the old tile's observed columns that the new one must keep
     min_geometry: Share = 0.6  # share of the voxels that lie within one voxel of the other build's, both ways
-    min_feature_cosine: Annotated[float, Field(ge=-1, le=1)] = 0.6  # of centred features of common voxels, the median
-    max_psnr_loss_db: Annotated[float, Field(ge=0)] = 1.5  # held-out, of the drives that both builds have
+    min_feature_cosine: Annotated[float, Field(ge=-1, le=1)] = 0.5  # of centred features of common voxels, the median
+    max_psnr_loss_db: Annotated[float, Field(ge=0)] = 2.0  # held-out, of the drives that both builds have
 
 
 class UpdateSettings(Settings):

@@ -22,6 +22,10 @@ NAMES = (
     "slab-before-write",  # in the middle of a tile's group
     "store-before-put",  # any document of the store: a city, a finished group, a generation
     "store-after-put",
+    "file-before-link",  # a document of a store in a folder, or a pin, is on the disk, not yet named
+    "store-before-delete",  # a generation, a tag, or the document of a build that nobody needs
+    "store-after-delete",
+    "group-half-deleted",  # a useless build has lost its document, not yet its chunks
     "lease-taken",  # the city is ours, nothing else was done
     "lease-ended",  # the city is free, the builds are not yet ended
     "publish-before",  # everything is validated, nothing is shown

@@ -29,7 +29,7 @@ class Evaluation:
     """Figures of a tile's held-out frames; empty where none are held out."""
 
     metrics: dict[str, float]  # means over images
-    drive_psnr_db: dict[str, float]  # mean psnr_db of each drive's images, by drive id
+    drive_psnr_db: dict[str, float]  # mean psnr_own_video_db of each drive's images, by drive id
 
 
 def evaluate_tile(
@@ -57,8 +57,8 @@ def evaluate_tile(
     report(Progress("evaluation", len(rows), len(rows)))
     psnr_db: dict[str, list[float]] = {}
     for drive_id, figures in zip(job.frames.drive_id[rows].tolist(), table, strict=True):
-        if "psnr_db" in figures:
-            psnr_db.setdefault(drive_id, []).append(figures["psnr_db"])
+        if "psnr_own_video_db" in figures:
+            psnr_db.setdefault(drive_id, []).append(figures["psnr_own_video_db"])
     names = sorted({name for figures in table for name in figures})
     return Evaluation(
         {name: float(np.mean([figures[name] for figures in table if name in figures])) for name in names},

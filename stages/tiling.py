@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from presight_core.config import TilingSettings
 from presight_core.errors import InputError
 from presight_core.recipes import digest_of
-from presight_core.tiles import SubField, Tile, Tiling
+from presight_core.tiles import SubField, Tile, Tiling, squared_distances
 
 Points = NDArray[np.float64]  # (N, 2) or (N, 3), world metres
 
@@ -67,7 +67,7 @@ def sub_fields(positions_world: ArrayLike, settings: TilingSettings) -> tuple[Su
     positions = _checked(positions_world, "tile")
     places = np.unique(positions, axis=0)
     centroids = k_means(places, min(settings.sub_field_count, len(places)), settings.seed)
-    owners = _squared_distances(positions, centroids).argmin(-1)
+    owners = squared_distances(positions, centroids).argmin(-1)
     kept = np.unique(owners)
     return tuple(_sub_field(centroids[i], positions[owners == i], settings) for i in kept)
 
@@ -91,7 +91,7 @@ def k_means(points: Points, count: int, seed: int) -> Points:
     best, least = points[:0], np.inf
     for _ in range(RESTARTS if count > 1 else 1):
         centroids = _lloyd(points, _spread_start(points, count, generator))
-        inertia = _squared_distances(points, centroids).min(-1).sum()
+        inertia = squared_distances(points, centroids).min(-1).sum()
         if inertia < least:
             best, least = centroids, inertia
     return best[np.lexsort(best.T[::-1])]
@@ -121,7 +121,10 @@ def _checked(positions_world: ArrayLike, of_what: str) -> Points:
 
 def _places(positions_world: Points) -> Points:
     """Sorted centres (M, 2) of the 5 m cells that hold a camera."""
-    return (np.unique(np.floor(positions_world[:, :2] / PLACE_M), axis=0) + 0.5) * PLACE_M
+    x, y = np.floor(positions_world[:, :2] / PLACE_M).astype(np.int64).T
+    cells = np.unique((x << 32) + y)  # as one number each, cells are sorted ten times as fast; by x, then by y
+    y = ((cells + 2**31) & 0xFFFFFFFF) - 2**31
+    return (np.stack([(cells - y) >> 32, y], -1).astype(np.float64) + 0.5) * PLACE_M
 
 
 def _tile_centroids(places: Points, settings: TilingSettings) -> Points:
@@ -157,14 +160,14 @@ def _spread_start(points: Points, count: int, generator: np.random.Generator) ->
     """k-means++: each next start is drawn with a chance in proportion to its squared distance to the others."""
     chosen = [points[generator.integers(len(points))]]
     while len(chosen) < count:
-        squared = _squared_distances(points, np.array(chosen)).min(-1)
+        squared = squared_distances(points, np.array(chosen)).min(-1)
         chosen.append(points[generator.choice(len(points), p=squared / squared.sum())])
     return np.array(chosen)
 
 
 def _lloyd(points: Points, centroids: Points) -> Points:
     for _ in range(ITERATIONS):
-        squared = _squared_distances(points, centroids)
+        squared = squared_distances(points, centroids)
         moved = _means(points, squared, len(centroids))
         step_m = np.abs(moved - centroids).max()
         centroids = moved
@@ -186,12 +189,4 @@ def _means(points: Points, squared: Points, count: int) -> Points:
 
 def _distance_m(points: Points, centroids: Points) -> Points:
     """Distance of each point (N, D) to its nearest centroid."""
-    return np.sqrt(_squared_distances(points, centroids).min(-1))
-
-
-def _squared_distances(points: Points, centroids: Points) -> Points:
-    """(N, K). Differences first, so that coordinates of kilometres keep their millimetres."""
-    squared = np.zeros((len(points), len(centroids)))
-    for axis in range(points.shape[1]):
-        squared += np.subtract.outer(points[:, axis], centroids[:, axis]) ** 2
-    return squared
+    return np.sqrt(squared_distances(points, centroids).min(-1))

@@ -5,18 +5,16 @@
 """
 
 import json
-import os
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 
 from presight_core.errors import NotFoundError, StoreError
 from presight_core.feature_space import FeatureSpace
 from presight_core.recipes import digest_of
-from storage.folders import whole_folder
+from storage.folders import create_file, whole_folder
 
 ARRAYS = tuple(field.name for field in fields(FeatureSpace) if field.name != "model_sha256")
 
@@ -70,15 +68,8 @@ class Artifacts:
     def pin_space(self, key: dict[str, Any], space_id: str) -> str:
         """Freeze which space a choice of model and channels (JSON) uses; returns the one pinned first."""
         file = self._pin(key)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part = file.with_name(f".{file.stem}-{uuid4().hex}.part")
-        part.write_text(json.dumps({"key": key, "space_id": space_id}, indent=2) + "\n", encoding="utf-8")
-        try:
-            os.link(part, file)  # fails where the pin exists: of two fits at once, one wins
-        except FileExistsError:
-            pass
-        finally:
-            part.unlink()
+        content = json.dumps({"key": key, "space_id": space_id}, indent=2) + "\n"
+        create_file(file, content.encode())  # of two fits at once, one wins
         return self.pinned_space(key) or space_id
 
     def pinned_space(self, key: dict[str, Any]) -> str | None:

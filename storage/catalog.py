@@ -13,7 +13,7 @@ from presight_core.errors import ConflictError, InputError, NotFoundError
 from storage.database import Database, Query, open_database
 from storage.leases import Clock, Lease, Leases, require_current, text_of
 from storage.migrations import HEAD
-from storage.tile_states import TileStates, record_end, record_progress, record_start, record_withdrawal
+from storage.tile_states import TileStates, record_end, record_progress, record_showing, record_start, record_withdrawal
 
 if TYPE_CHECKING:  # these import numpy, which `presight status` has no time for
     from presight_core.drives import Drive, Reject
@@ -81,6 +81,14 @@ class Catalog:
 
             upgrade(database)
         return Catalog(database, clock)
+
+    @staticmethod
+    def unchecked(url: str, clock: Clock = utc_now) -> "Catalog":
+        """The catalog at a URL, unasked whether its schema is this version's: that takes a connection of its own.
+
+        For reading where time counts. What then raises StoreError may be cured by `open`.
+        """
+        return Catalog(open_database(url), clock)
 
     def now(self) -> str:
         """The time by the catalog's clock, as it is recorded."""
@@ -244,12 +252,27 @@ class Catalog:
                     raise ConflictError(f"build {build_id} was ended before, as failed; run `presight build` again")
                 raise NotFoundError(f"no build {build_id}; start it with start_build")
 
-    def withdraw_tile(self, city: str, tile_id: str) -> None:
-        """Record that the city shows no build of a tile any more."""
+    def withdraw_tile(self, city: str, tile_id: str, lease: Lease | None = None) -> None:
+        """Record that the city shows no build of a tile any more. Raises LeaseLostError if `lease` is over."""
         with self._database.writing() as query:
+            if lease:
+                require_current(query, lease)
             now = self._now()
             query(WITHDRAW, city=city, tile_id=tile_id, now=now)
             record_withdrawal(query, city, tile_id, now)
+
+    def show_again(self, build: Build, lease: Lease | None = None) -> None:
+        """Record that the city shows an earlier build of a tile; `build`: as the prior tells it, of unknown number.
+
+        A build that the catalog never knew is left alone. Raises LeaseLostError if `lease` is over.
+        """
+        place = {"city": build.city, "tile_id": build.tile_id}
+        with self._database.writing() as query:
+            if lease:
+                require_current(query, lease)
+            for row in query(SHOW_BUILD, **place, started_at=build.started_at, digest=build.recipe_digest):
+                query(HIDE_LATER, **place, build_id=row["build_id"])
+                record_showing(query, vars(build))
 
     def builds(self, city: str, state: str | None = None) -> list[Build]:
         """The latest build of every tile of a city, by tile; of those in `state`, if given."""
@@ -344,6 +367,13 @@ FINISH_BUILD = """
 WITHDRAW = """
     UPDATE builds SET state = 'withdrawn', updated_at = :now
     WHERE city = :city AND tile_id = :tile_id AND state = 'published'"""
+SHOW_BUILD = """
+    UPDATE builds SET state = 'published', updated_at = COALESCE(finished_at, updated_at) WHERE build_id =
+    (SELECT MAX(build_id) FROM builds WHERE city = :city AND tile_id = :tile_id AND recipe_digest = :digest
+     AND started_at = :started_at AND state IN ('published', 'withdrawn')) RETURNING build_id"""
+HIDE_LATER = """
+    UPDATE builds SET state = 'withdrawn'
+    WHERE city = :city AND tile_id = :tile_id AND state = 'published' AND build_id > :build_id"""
 LATEST_BUILDS = """
     SELECT * FROM builds WHERE build_id IN
     (SELECT MAX(build_id) FROM builds WHERE city = :city AND state = COALESCE(:state, state) GROUP BY tile_id)

@@ -5,7 +5,7 @@ making or migrating the schema; both ways run the same SQL, with `:named` values
 """
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -32,6 +32,10 @@ class Query(Protocol):
 
     def __call__(self, sql: str, **values: Any) -> list[dict[str, Any]]:
         """The rows that the statement returns, if any, by column name."""
+        ...
+
+    def tuples(self, sql: str, **values: Any) -> Sequence[Sequence[Any]]:
+        """The same rows as the statement orders their columns: for thousands of them."""
         ...
 
 
@@ -140,6 +144,9 @@ class _SqliteQuery:
         names = [column[0] for column in cursor.description or ()]
         return [dict(zip(names, row, strict=True)) for row in cursor]
 
+    def tuples(self, sql: str, **values: Any) -> Sequence[Sequence[Any]]:
+        return self.connection.execute(sql, values).fetchall()
+
 
 class SqlalchemyDatabase:
     """Any database that SQLAlchemy reaches."""
@@ -201,6 +208,11 @@ class _SqlalchemyQuery:
         result = self.connection.execute(text(sql), values)
         return [dict(row) for row in result.mappings()] if result.returns_rows else []
 
+    def tuples(self, sql: str, **values: Any) -> Sequence[Sequence[Any]]:
+        from sqlalchemy import text
+
+        return self.connection.execute(text(sql), values).all()
+
 
 def take_write_lock(connection: "Connection") -> None:
     """Keep all other writers waiting until the transaction ends. SQLite has done so at its begin."""
@@ -219,8 +231,10 @@ def _engine(url: Any) -> "Engine":
     """An engine that keeps no connection open. Raises StoreError for a URL that is none."""
     from sqlalchemy import NullPool, create_engine, exc
 
+    # Without it psycopg asks every new connection for a type that the catalog does not use.
+    options = {"use_native_hstore": False} if str(url).startswith("postgresql+psycopg") else {}
     try:
-        engine = create_engine(url, poolclass=NullPool)
+        engine = create_engine(url, poolclass=NullPool, **options)
     except ModuleNotFoundError as error:
         cure = f"`pip install {'psycopg[binary]' if 'psycopg' in str(error.name) else error.name}`"
         raise MissingDependencyError(f"the catalog's database needs the package {error.name}; {cure}") from error

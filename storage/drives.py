@@ -50,7 +50,7 @@ class DriveIndex:
         table = _to_arrow(frames).replace_schema_metadata({METADATA_KEY: json.dumps(description).encode()})
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            _write_whole(table, self._file(drive.drive_id))
+            write_whole(table, self._file(drive.drive_id))
         except OSError as error:
             raise StoreError(f"{self.folder}: drive {drive.name} not written: {error}; free the disk") from error
         return added_at
@@ -74,9 +74,19 @@ class DriveIndex:
 
     def frames(self, drive_id: str) -> FrameTable:
         """The frames of a drive, ordered by camera and time. Raises NotFoundError, or StoreError if damaged."""
+        return FrameTable(**self._columns(drive_id, [field.name for field in fields(FrameTable)]))
+
+    def positions(self, drive_id: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Camera centres (N, 3) of a drive's frames, world metres, and which are keyframes; quicker than `frames`."""
+        columns = self._columns(drive_id, ["world_from_camera", "is_keyframe"])
+        return columns["world_from_camera"][:, :3, 3].copy(), columns["is_keyframe"]
+
+    def _columns(self, drive_id: str, names: list[str]) -> dict[str, NDArray]:
         file = self._existing(drive_id)
         try:
-            return _from_arrow(parquet.read_table(file, columns=[field.name for field in fields(FrameTable)]))
+            with parquet.ParquetFile(file) as source:  # `read_table` takes three times as long to open a file
+                table = source.read(names, use_threads=False)
+            return {name: _values(name, table.column(name)) for name in names}
         except (pa.ArrowException, OSError, KeyError, ValueError) as error:
             raise _damaged(file, error) from error
 
@@ -145,10 +155,6 @@ def _column(name: str, values: NDArray) -> pa.Array:
     return pa.array(values)
 
 
-def _from_arrow(table: pa.Table) -> FrameTable:
-    return FrameTable(**{field.name: _values(field.name, table.column(field.name)) for field in fields(FrameTable)})
-
-
 def _values(name: str, column: pa.ChunkedArray) -> NDArray:
     array = column.combine_chunks()
     if name in TEXTS:
@@ -158,8 +164,8 @@ def _values(name: str, column: pa.ChunkedArray) -> NDArray:
     return np.array(array)  # a copy: Arrow's own memory is read-only, which torch warns about
 
 
-def _write_whole(table: pa.Table, file: Path) -> None:
-    """Write beside the file, force it to the disk, then put it in place: a crash leaves the old or the new."""
+def write_whole(table: pa.Table, file: Path) -> None:
+    """Write beside the file, force it to the disk, then put it in place: a crash leaves the old Parquet or the new."""
     part = file.with_name(f".{file.stem}-{uuid4().hex}.part")
     try:
         with part.open("xb") as target:

@@ -149,6 +149,16 @@ class PriorStore:
             return None
         return read_generation(self._source, city, number)
 
+    def first_showing(self, head: Generation, tile_id: str) -> int:
+        """The generation that brought what `head` shows for a tile, of those that are left without a gap."""
+        numbers, number = set(self.generations(head.city)), head.number
+        while number - 1 in numbers:
+            before = read_generation(self._source, head.city, number - 1)
+            if before.tiles.get(tile_id) != head.tiles[tile_id]:
+                break
+            number -= 1
+        return number
+
     def generations(self, city: str) -> list[int]:
         """Numbers of the published generations, ascending."""
         return generation_numbers(self._source, city)
@@ -173,7 +183,7 @@ class PriorStore:
     def remove_tag(self, city: str, tag: str) -> None:
         """Take a tag away; the generation stays, until it is old. Raises NotFoundError if there is no such tag."""
         read_tag(self._source, city, tag)
-        remove(self._objects, [tag_path(city, tag)])
+        remove(self._objects, tag_path(city, tag))
 
     def rollback(self, city: str, number: int) -> int:
         """Publish a new generation that shows exactly what an earlier one did; its number.

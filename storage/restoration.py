@@ -15,6 +15,7 @@ from presight_core.recipes import Recipe
 from presight_core.tiles import Tiling
 from storage.catalog import Build, Catalog
 from storage.drives import DriveIndex
+from storage.leases import Lease
 from storage.priors import PriorStore
 
 KIND = "tilings"
@@ -60,7 +61,25 @@ def restore(catalog: Catalog, index: DriveIndex, store: PriorStore) -> dict[str,
             is_shown = head is not None and build.tile_id in head.tiles
             catalog.restore_build(build if is_shown else replace(build, state="withdrawn"))
             counts["builds"] += 1
+        follow(catalog, store, city)
     return counts
+
+
+def follow(catalog: Catalog, store: PriorStore, city: str, lease: Lease | None = None) -> None:
+    """Let the catalog tell of every tile what the newest generation shows; it wants this after a rollback or a crash.
+
+    Raises LeaseLostError if `lease` is over: then it is somebody else's to tell.
+    """
+    head, told = store.generation(city), {build.tile_id: build for build in catalog.builds(city, "published")}
+    shown = head.tiles if head else {}
+    for tile_id in sorted(told.keys() - shown.keys()):
+        catalog.withdraw_tile(city, tile_id, lease)
+    for tile_id, tile in shown.items():
+        started_at = tile.lineage.get("build", {}).get("started_at")
+        if started_at and (tile_id not in told or told[tile_id].started_at != started_at):
+            assert head is not None
+            build = _row(city, tile_id, tile, store.first_showing(head, tile_id), catalog.now())
+            catalog.show_again(build, lease)
 
 
 def _restore_tilings(catalog: Catalog, store: PriorStore, city: str) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from presight_core.priors.documents import checked_name, generation_path
 from presight_core.priors.location import ReadLocation
 from presight_core.priors.reader import generation_numbers, read_generation, read_tag
-from storage.location import StoredObject, objects, open_store, remove
+from storage.location import StoredObject, objects, open_store, remove, remove_group
 
 BUILD_DEPTH = 4  # <city>/tiles/<tile>/<build>: the parts of a path that name a build
 
@@ -47,9 +47,11 @@ def collect(location: str | Path, city: str, retention: Retention, now: datetime
     published meanwhile, the builds. If it breaks off, running it again does the rest.
     """
     store, first = open_store(location), find_garbage(location, city, retention, now)
-    remove(store, [generation_path(city, number) for number in first.generations])
+    for number in first.generations:  # the oldest first, so that what is left has no gaps
+        remove(store, generation_path(city, number))
     second = find_garbage(location, city, retention, now)
-    remove(store, [entry.path for entry in second.objects])
+    for build in second.builds:
+        remove_group(store, build)
     return Garbage(first.generations, second.builds, second.objects)
 
 

@@ -19,7 +19,7 @@ from presight_core.priors.chunks import array_document, chunk_checksum, chunk_pa
 from presight_core.priors.documents import VERSION, CityDocument, TileEntry, lattice_to_json, tile_path
 from presight_core.priors.schema import ArraySpec, VoxelBatch, array_specs, check_batch, pack_features
 from presight_core.recipes import canonical_json
-from storage.location import exists, put_once, remove_all, size_bytes, storing
+from storage.location import exists, put_once, remove_group, settle, size_bytes, storing
 
 SLAB_CHUNKS = 32  # written at once, so that they are compressed and sent side by side: 4 MB of features
 MOST_WRITES = 8  # at once: hides the latency of an object store
@@ -172,7 +172,7 @@ class _ArrayWriter:
 def _clear_unfinished(store: ObjectStore, root: str) -> None:
     if exists(store, f"{root}/zarr.json"):
         raise ConflictError(f"{root} was written before; give the new build a name of its own")
-    remove_all(store, root)
+    remove_group(store, root)
 
 
 def _facts(city: CityDocument, name: TileName, drives: Sequence[str]) -> dict[str, Any]:
@@ -191,6 +191,7 @@ def _facts(city: CityDocument, name: TileName, drives: Sequence[str]) -> dict[st
 def _finish(store: ObjectStore, root: str, attributes: dict[str, Any]) -> bytes:
     document = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
     content = json.dumps(document, allow_nan=False).encode()
+    settle(store, root)  # the document must not name chunks that are not on the disk
     if not put_once(store, f"{root}/zarr.json", content):
         raise ConflictError(f"{root} was written by somebody else meanwhile; give the new build a name of its own")
     return content

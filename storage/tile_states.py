@@ -4,6 +4,7 @@ The rows are written in the transactions that write the builds, so that the two 
 neither the history of builds nor any JSON, which is what makes the status of ten thousand tiles quick.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -26,24 +27,23 @@ class PlannedTile(NamedTuple):
 class TileState(NamedTuple):
     """One tile. Times are UTC, ISO 8601. A tuple, as ten thousand of them are made at once."""
 
-    city: str
     tile_id: str
     state: str  # planned, queued, running, failed, built, published, stale or withdrawn
     stage: str  # of the newest build
     done: int
     total: int
-    stage_at: str | None
-    stage_done: int
     error: str  # first line
     reasons: str  # why it is stale or planned, as the last plan said
     drive_count: int
     frame_count: int
     started_at: str | None
     updated_at: str | None
-    voxels: int | None  # this and the rest: of the build that the prior shows
+    voxels: int | None  # this and the next three: of the build that the prior shows
     psnr_db: float | None
     generation: int | None
     published_at: str | None
+    stage_at: str | None  # when its stage began
+    stage_done: int  # how far the stage was then
 
 
 class CityTotal(NamedTuple):
@@ -71,6 +71,7 @@ class Snapshot(NamedTuple):
     drives: dict[str, CityDrives]  # by city
     totals: list[CityTotal]
     tiles: list[TileState]  # of the city that was asked for, none for all cities
+    metrics: dict[str, Any]  # all figures of the build that is shown; of one tile only
 
 
 class TileStates:
@@ -89,9 +90,10 @@ class TileStates:
             drives = query(DRIVES_OF_CITY, city=city) if city else query(DRIVES)
             totals = query(TOTALS_OF_CITY, city=city) if city else query(TOTALS)
             tiles = _tiles(query, city, tile_id, most) if city else []
+            metrics = query(SHOWN_METRICS, city=city, tile_id=tile_id) if tile_id else []
         present = {row["city"]: CityDrives(int(row["present"]), row["changed_at"]) for row in drives}
-        found = [TileState._make(row.values()) for row in tiles]
-        return Snapshot(present, [CityTotal._make(row.values()) for row in totals], found)
+        figures = json.loads(metrics[0]["metrics"]) if metrics else {}
+        return Snapshot(present, [CityTotal._make(row.values()) for row in totals], tiles, figures)
 
     def save_plan(self, city: str, tiles: Sequence[PlannedTile], now: str) -> None:
         """Record what a plan of a city says; tiles that it does not have and that never were built are forgotten."""
@@ -109,10 +111,14 @@ class TileStates:
                 query(MARK_STALE, city=city, tile_id=tile_id, reason=reason)
 
 
-def _tiles(query: Query, city: str, tile_id: str | None, most: int | None) -> list[dict[str, Any]]:
+def _tiles(query: Query, city: str, tile_id: str | None, most: int | None) -> list[TileState]:
     if tile_id is not None:
-        return query(ONE_TILE, city=city, tile_id=tile_id)
-    return query(TILES_OF_CITY, city=city) if most is None else query(NEWS_FIRST, city=city, most=most)
+        rows = query.tuples(ONE_TILE, city=city, tile_id=tile_id)
+    elif most is not None:
+        rows = query.tuples(NEWS_FIRST, city=city, most=most)
+    else:
+        rows = query.tuples(TILES_OF_CITY, city=city)
+    return list(map(TileState._make, rows))
 
 
 def record_start(query: Query, city: str, tile_id: str, now: str) -> None:
@@ -141,6 +147,13 @@ def record_withdrawal(query: Query, city: str, tile_id: str, now: str) -> None:
     query(WITHDRAW, city=city, tile_id=tile_id, now=now)
 
 
+def record_showing(query: Query, build: Mapping[str, Any]) -> None:
+    """The prior shows an earlier build of a tile; `build`: city, tile_id, metrics, recipe_digest, finished_at."""
+    shown = {name: build["metrics"].get(name) for name in ("voxels", "psnr_db", "generation")}
+    place = {"city": build["city"], "tile_id": build["tile_id"]}
+    query(SHOW, **place, **shown, digest=build["recipe_digest"], published_at=build["finished_at"])
+
+
 STATE = """
     CASE WHEN state = 'running' AND stage = '' THEN 'queued' WHEN state = '' THEN 'planned'
     WHEN state = 'published' AND reasons <> '' THEN 'stale' ELSE state END"""
@@ -151,6 +164,9 @@ NEWS_FIRST = f"""
     SELECT {COLUMNS} FROM tile_states WHERE city = :city AND {IS_SHOWN}
     ORDER BY CASE WHEN state = 'published' AND reasons = '' THEN 1 ELSE 0 END, tile_id LIMIT :most"""
 ONE_TILE = f"SELECT {COLUMNS} FROM tile_states WHERE city = :city AND tile_id = :tile_id"
+SHOWN_METRICS = """
+    SELECT metrics FROM builds WHERE city = :city AND tile_id = :tile_id AND state = 'published'
+    ORDER BY build_id DESC LIMIT 1"""
 TOTALS = f"""
     SELECT city, {STATE} AS state, COUNT(*) AS tile_count, CAST(SUM(voxels) AS BIGINT) AS voxels,
            MAX(generation) AS generation, MAX(planned_at) AS planned_at, MAX(updated_at) AS updated_at
@@ -183,6 +199,11 @@ END = """
 PUBLISH = """
     UPDATE tile_states SET voxels = :voxels, psnr_db = :psnr_db, generation = :generation, published_at = :now,
         reasons = CASE WHEN plan_digest IN ('', :digest) THEN '' ELSE reasons END
+    WHERE city = :city AND tile_id = :tile_id"""
+SHOW = """
+    UPDATE tile_states SET voxels = :voxels, psnr_db = :psnr_db, generation = :generation,
+        published_at = :published_at, state = CASE WHEN state = 'withdrawn' THEN 'published' ELSE state END,
+        reasons = CASE WHEN plan_digest = :digest THEN '' ELSE 'an earlier build is shown again' END
     WHERE city = :city AND tile_id = :tile_id"""
 WITHDRAW = """
     UPDATE tile_states SET state = CASE WHEN state = 'published' THEN 'withdrawn' ELSE state END, voxels = NULL,

@@ -1,10 +1,9 @@
 """The tiny network: one small U-Net that gives both logits and features, and its two ONNX files."""
 
-import warnings
 from pathlib import Path
 
-import onnx
 import torch
+from shipped_model import write_onnx
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, pixel_shuffle, relu
 
@@ -12,11 +11,7 @@ from presight_core.classes import CITYSCAPES
 
 CLASS_COUNT = len(CITYSCAPES)
 FEATURE_CHANNELS = 64  # as many as a prior keeps
-INPUT_HEIGHT_PX, INPUT_WIDTH_PX = 224, 400  # 16:9 but for one row, and whole strides of 8
 LOGIT_STRIDE, FEATURE_STRIDE = 2, 8
-OPSET = (
-    17  # the newest that torch's own exporter writes without further packages and that every runtime since 2022 reads
-)
 
 
 class TinyNetwork(nn.Module):
@@ -101,22 +96,7 @@ def export(network: TinyNetwork, kind: str, file: Path) -> None:
     kind: "segmentation" or "features".
     """
     module = (_Segmentation if kind == "segmentation" else _Features)(network.eval())
-    output = "logits" if kind == "segmentation" else "features"
-    example = torch.zeros(1, 3, INPUT_HEIGHT_PX, INPUT_WIDTH_PX)
-    with warnings.catch_warnings():
-        # torch's newer exporter needs onnxscript, which nothing else here does.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.onnx.export(
-            module,
-            (example,),
-            str(file),
-            input_names=["image"],
-            output_names=[output],
-            dynamic_axes={"image": {0: "images"}, output: {0: "images"}},
-            opset_version=OPSET,
-            dynamo=False,
-        )
-    onnx.checker.check_model(str(file), full_check=True)
+    write_onnx(module, "logits" if kind == "segmentation" else "features", file)
 
 
 def _convolve(inputs: int, outputs: int, stride: int = 1, size: int = 3) -> nn.Sequential:

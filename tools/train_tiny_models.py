@@ -7,8 +7,6 @@ for SegFormer and DINO in the demo and in tests, and say so on their cards.
 """
 
 import argparse
-import hashlib
-import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,14 +16,13 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from shipped_model import INPUT_HEIGHT_PX, INPUT_WIDTH_PX, MEAN, STD, write_card
 from tiny_augment import COARSE_CROP_PX, WHOLE_CROP_PX, Finder, another_camera, random_crop
 from tiny_losses import class_weights, segmentation_loss
 from tiny_network import (
     CLASS_COUNT,
     FEATURE_CHANNELS,
     FEATURE_STRIDE,
-    INPUT_HEIGHT_PX,
-    INPUT_WIDTH_PX,
     LOGIT_STRIDE,
     TinyNetwork,
     export,
@@ -36,7 +33,6 @@ from torch import Tensor
 
 from presight_core.synthetic.lighting import KINDS
 
-MEAN, STD = (0.45, 0.45, 0.45), (0.25, 0.25, 0.25)  # of street pictures, roughly; batch normalisation does the rest
 OUTPUTS = {  # name of the output, input pixels a cell, channels
     "segmentation": ("logits", LOGIT_STRIDE, CLASS_COUNT),
     "features": ("features", FEATURE_STRIDE, FEATURE_CHANNELS),
@@ -150,36 +146,12 @@ def measure(network: TinyNetwork, views: LabelledImages) -> Scores:
 
 def write_models(network: TinyNetwork, note: str, folder: Path) -> None:
     """The ONNX pair and its cards."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for kind in OUTPUTS:
+    for kind, (output, stride, channels) in OUTPUTS.items():
         file = folder / f"{kind}.onnx"
         export(network, kind, file)
-        write_card(file, kind, note)
-
-
-def write_card(file: Path, kind: str, note: str) -> None:
-    """The model card beside an ONNX file."""
-    output, stride, channels = OUTPUTS[kind]
-    card = {
-        "name": f"tiny-{kind}",
-        "kind": kind,
-        "file": file.name,
-        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-        "input": "image",
-        "input_height_px": INPUT_HEIGHT_PX,
-        "input_width_px": INPUT_WIDTH_PX,
-        "mean": list(MEAN),
-        "std": list(STD),
-        "output": output,
-        "layout": "NCHW",
-        "stride": stride,
-        "channels": channels,
-        "licence": "Apache-2.0",
-        "source": "tools/train_tiny_models.py of PreSight",
-        "note": note,
-    }
-    lines = [f"{key} = {json.dumps(value)}" for key, value in card.items()]  # JSON's values are TOML's here
-    file.with_suffix(".toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        shape = {"output": output, "stride": stride, "channels": channels}
+        source = "tools/train_tiny_models.py of PreSight"
+        write_card(file, name=f"tiny-{kind}", kind=kind, **shape, source=source, note=note)
 
 
 def card_note(measured: Scores, steps: int) -> str:

@@ -26,6 +26,35 @@ def truncated_exponential(x: Tensor) -> Tensor:
     return TruncatedExponential.apply(x)  # type: ignore[return-value]
 
 
+class FadedGradient(torch.autograd.Function):
+    """The identity, whose gradient is multiplied."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, scale: Tensor) -> Tensor:
+        ctx.save_for_backward(scale)
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (scale,) = ctx.saved_tensors
+        return gradients[0] * scale, None
+
+
+def fade_gradient(x: Tensor, scale: Tensor) -> Tensor:
+    """`x` itself; its gradient is multiplied by `scale`, which must broadcast to it."""
+    return FadedGradient.apply(x, scale)  # type: ignore[return-value]
+
+
+def share_of_rays(edges_m: Float[Tensor, "rays edges"], full_m: float) -> Float[Tensor, "rays samples"]:
+    """How densely rays pass samples, against samples at `full_m`: the squared ratio of distances, 1 beyond.
+
+    Near a camera a volume is met by far more rays than far from it, so it learns faster, and fog grows there. Gradients
+    scaled by this undo it (Philip and Deschaintre, Floaters No More, 2023).
+    """
+    middles_m = (edges_m[:, 1:] + edges_m[:, :-1]) / 2
+    return (middles_m / full_m).square().clamp_max(1)
+
+
 def ray_weights(
     density: Float[Tensor, "rays samples"], lengths_m: Float[Tensor, "rays samples"]
 ) -> Float[Tensor, "rays samples"]:

@@ -68,12 +68,13 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How samples are placed in one pass. The default is that of evaluation: nothing random."""
+    """How samples are placed in one pass, and learn. The default is that of evaluation: nothing random."""
 
     jitter: Float[Tensor, "rays passes"] | None = None  # in [0, 1), a column for each proposal and the field; or none
     anneal: float | Tensor = 1.0  # exponent of the proposals' weights; below 1 they are flattened
     train_proposals: bool = False
     left: float = 0.0  # a ray is followed until this share of it is left; the proposals' samples beyond weigh nothing
+    fade_m: float = 0.0  # samples nearer to the camera than this learn less; see `fade_gradient`
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,11 @@ class PointValues:
     density: Float[Tensor, "rays samples"]
     rgb: Float[Tensor, "rays samples 3"]
     features: Float[Tensor, "rays samples channels"]
+
+    def faded(self, scale: Float[Tensor, "rays samples"]) -> "PointValues":
+        """The same values, whose gradients are multiplied by `scale`."""
+        colours, channels = (rendering.fade_gradient(values, scale[..., None]) for values in (self.rgb, self.features))
+        return PointValues(rendering.fade_gradient(self.density, scale), colours, channels)
 
 
 @dataclass(frozen=True)
@@ -199,6 +205,8 @@ class TileField(nn.Module):
         proposals, edges = self.place_samples(rays, sampling)
         edges_m = self.spacing(rays).metres(edges)
         values = self.query(rays.points(edges_m), conditions)
+        if sampling.fade_m:
+            values = values.faded(rendering.share_of_rays(edges_m, sampling.fade_m))
         weights = rendering.ray_weights(values.density, edges_m.diff(dim=-1))
         behind = 1 - weights.sum(-1, keepdim=True)
         sky_rgb, sky_features = self._sky(rays, conditions)

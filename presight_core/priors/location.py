@@ -60,7 +60,10 @@ class ReadLocation:
         """Names of the objects directly in a folder; empty if there is none."""
         try:
             if isinstance(self._place, Path):
-                return sorted(entry.name for entry in (self._place / folder).iterdir() if entry.is_file())
+                entries = (self._place / folder).iterdir()
+                return sorted(
+                    entry.name for entry in entries if entry.is_file() and "#" not in entry.name
+                )  # unfinished
             objects = obstore.list_with_delimiter(self._place, folder)["objects"]
             # Some servers list a folder that was emptied as an object of the folder's own name.
             paths = [entry["path"] for entry in objects if entry["path"].startswith(f"{folder}/")]

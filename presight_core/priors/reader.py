@@ -1,7 +1,8 @@
 """Reads the prior around a vehicle from a store: only the chunks it needs, and no Zarr library."""
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,10 @@ from presight_core.priors.tile_table import LOOK_ARRAYS, TilePart, TileTable
 from presight_core.priors.window import Range, Window, WindowBox
 
 CACHE_BYTES = 128 << 20  # of decoded chunks in each reader, so in each worker of a data loader: 1.5 million voxels
+
+
+class CollectedError(NotFoundError):
+    """The generation that a reader pinned was removed by `presight gc`; open another one."""
 
 
 class PriorReader:
@@ -99,7 +104,8 @@ class PriorReader:
         """The prior in the given box of the ego frame, metres; empty outside the city.
 
         without_drives: voxels that no other drive saw are left out; the others keep what all drives made of them.
-        Raises InputError for a pose that is not rigid, StoreError if stored data is lost or damaged.
+        Raises InputError for a pose that is not rigid, StoreError if stored data is lost or damaged, CollectedError
+        if it is gone because the generation was removed.
         """
         return self._window(WindowBox.at(world_from_ego, x_m, y_m, z_m), without_drives)
 
@@ -118,8 +124,9 @@ class PriorReader:
         boxes = [WindowBox.at(pose, x_m, y_m, z_m) for pose in world_from_ego]
         if boxes and ReadLocation(self._location).is_remote:
             blocks = np.unique(np.concatenate([box.blocks(self.lattice) for box in boxes]), axis=0)
-            for tile_id in self._tiles_with(blocks):
-                self.tile(tile_id).warm(blocks)
+            with self._told_when_collected():
+                for tile_id in self._tiles_with(blocks):
+                    self.tile(tile_id).warm(blocks)
         return [self._window(box, without_drives) for box in boxes]
 
     def tile(self, tile_id: str) -> TileTable:
@@ -130,16 +137,33 @@ class PriorReader:
             raise NotFoundError(f"{self._city.city} generation {self.generation.number} has no tile {tile_id}")
         if tile_id not in self._tables:
             tile = self.generation.tiles[tile_id]
-            self._tables[tile_id] = TileTable.open(ReadLocation(self._location), self._city, tile, self._cache)
+            with self._told_when_collected():
+                self._tables[tile_id] = TileTable.open(ReadLocation(self._location), self._city, tile, self._cache)
         return self._tables[tile_id]
+
+    @contextmanager
+    def _told_when_collected(self) -> Iterator[None]:
+        """Say so if what cannot be read is gone because `presight gc` removed the generation meanwhile."""
+        try:
+            yield
+        except StoreError as error:
+            city, number = self._city.city, self.generation.number
+            path = generation_path(city, number)
+            if number == 0 or ReadLocation(self._location).read(path) is not None:
+                raise
+            raise CollectedError(
+                f"{city}: generation {number} was removed while it was read; open the newest one, and tag the "
+                f"generation of a long run: presight tag {city} NAME --generation N"
+            ) from error
 
     def _window(self, box: WindowBox, without_drives: Collection[str]) -> Window:
         blocks = box.blocks(self.lattice)
-        parts = {
-            tile_id: part
-            for tile_id in self._tiles_with(blocks)
-            if (part := self.tile(tile_id).read(box, blocks, without_drives)) is not None
-        }
+        with self._told_when_collected():
+            parts = {
+                tile_id: part
+                for tile_id in self._tiles_with(blocks)
+                if (part := self.tile(tile_id).read(box, blocks, without_drives)) is not None
+            }
         missing = self._missing_tiles(box) if self._unbuilt else ()
         return _window(box, self.lattice, self.channel_count, parts, missing)
 

@@ -125,6 +125,16 @@ def test_the_ground_loss_is_the_missing_weight_beyond_the_start_of_the_ground():
     assert loss.item() == pytest.approx(-math.log((0.5 + 0.1) / 1.1) / 2)  # the second ray knows of no ground
 
 
+def test_fading_keeps_values_and_scales_gradients_by_the_squared_distance():
+    density = torch.ones(1, 3, requires_grad=True)
+    edges_m = torch.tensor([[0.0, 2.0, 8.0, 40.0]])  # middles at 1, 5 and 24 m
+    faded = rendering.fade_gradient(density, rendering.share_of_rays(edges_m, 10.0))
+    assert torch.equal(faded, density)
+    faded.sum().backward()
+    assert density.grad is not None
+    torch.testing.assert_close(density.grad, torch.tensor([[0.01, 0.25, 1.0]]))
+
+
 def test_distortion_equals_the_sum_over_all_pairs():
     edges, weights = random_histogram(9, 0)
     middles = (edges[:, 1:] + edges[:, :-1]) / 2

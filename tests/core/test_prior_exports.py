@@ -5,6 +5,7 @@ import os
 import warnings
 from pathlib import Path
 from pickle import Unpickler, dumps
+from pickletools import genops
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from presight_core.priors import PriorReader
 from presight_core.priors.documents import GenerationTile
 from presight_core.priors.example import ExampleTile
 from presight_core.priors.exports import write_npy, write_ply, write_stac
-from presight_core.priors.legacy import LegacyTile, legacy_batches, read_legacy, write_legacy
+from presight_core.priors.legacy import ALLOWED, LegacyTile, legacy_batches, read_legacy, write_legacy
 from presight_core.priors.schema import array_specs, check_batch, unpack_columns
 from storage.priors import PriorStore
 from storage.tile_groups import TileName
@@ -83,10 +84,21 @@ def test_a_city_of_the_paper_has_as_many_pickles_as_the_configurations_read(tmp_
     np.testing.assert_array_equal(released_rows(files)["hits"], window.hits)
 
 
-def test_pickles_name_nothing_that_only_numpy_2_has(tmp_path: Path):
+def test_pickles_ask_for_nothing_that_python_38_and_numpy_119_have_not(tmp_path: Path):
+    asked: set[tuple[str, str]] = set()
+
+    class Asking(Unpickler):
+        def find_class(self, module: str, name: str):
+            asked.add((module, name))
+            return ALLOWED[module, name]
+
     for file in write_legacy(city(tmp_path / "store"), tmp_path):
-        assert b"numpy.core.multiarray" in file.read_bytes()
-        assert b"numpy._core" not in file.read_bytes()
+        operations = list(genops(file.read_bytes()))
+        assert operations[0][1] == 4, "the protocol that the file says"
+        assert max(operation.proto for operation, _, _ in operations) <= 4
+        with file.open("rb") as opened:
+            Asking(opened).load()
+    assert asked == {("numpy.core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype")}
 
 
 def test_what_was_exported_reads_back_through_the_restricted_reader(tmp_path: Path):

@@ -91,6 +91,16 @@ def test_every_parameter_learns():
     assert idle == []
 
 
+def test_fading_changes_what_a_field_learns_but_not_what_it_shows():
+    field = small_field()
+    rays = field.rays(*random_rays(50))
+    plain, faded = (field(rays, Sampling(fade_m=fade_m)).rgb for fade_m in (0.0, 1e3))
+    assert torch.equal(plain, faded)
+    network = next(field.colour.parameters())
+    strong, weak = (torch.autograd.grad(rgb.sum(), network)[0].abs().sum() for rgb in (plain, faded))
+    assert 0 < weak < strong / 10
+
+
 def test_copies_of_tables_are_read_and_follow_the_tables():
     field, rays = small_field(), random_rays(5)
     exact = field(field.rays(*rays)).rgb

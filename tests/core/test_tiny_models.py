@@ -1,4 +1,4 @@
-"""The shipped stand-in networks: their cards, their size, and what they can do."""
+"""The shipped networks: their cards, their size, and what they can do."""
 
 import hashlib
 import importlib
@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from presight_core.classes import CITYSCAPES
-from presight_core.model_card import MODELS_FOLDER
+from presight_core.model_card import MODELS_FOLDER, ModelCard
 from presight_core.synthetic.lighting import KINDS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -102,6 +102,27 @@ def test_an_exported_network_computes_what_torch_computes(tools: None, tmp_path:
     with torch.no_grad():
         expected = network.eval()(torch.from_numpy(images(2)))[MODELS.index(kind)].numpy()
     np.testing.assert_allclose(run(session_of(file), images(2)), expected, atol=1e-4)
+
+
+def test_the_colour_model_says_what_is_in_a_patch_and_around_it():
+    card = ModelCard.load("colours", "features")
+    grey = np.zeros((1, 3, 224, 400), np.float32)
+    grey[:, :, 104:112, 200:208] = np.arange(8) % 4 // 2  # a patch of upright stripes, two pixels wide
+    seen = run(session_of(card.file), grey)[0]
+    assert seen.shape == (card.channels, card.rows, card.columns)
+    patch, empty = seen[:8, 13, 25], seen[:8, 0, 0]
+    np.testing.assert_allclose(patch[:4], 0.5, atol=1e-3)  # mean red, green, blue; deviation of brightness
+    assert patch[4] > 4 * patch[5]  # edges are met along x, and along y only where the patch ends
+    np.testing.assert_allclose(empty, 0, atol=1e-6)
+    np.testing.assert_allclose(seen[8, 12:15, 24:27], 0.5 / 9, atol=1e-3)  # the window around it has nine patches
+
+
+def test_the_colour_model_is_what_its_script_writes(tools: None):
+    colours = module("write_colour_model").ColourStatistics()
+    with torch.no_grad():
+        expected = colours(torch.from_numpy(images(2))).numpy()
+    shipped = ModelCard.load("colours", "features").file
+    np.testing.assert_allclose(run(session_of(shipped), images(2)), expected, atol=1e-4)
 
 
 def test_a_crop_keeps_image_and_labels_together(tools: None):

@@ -7,10 +7,10 @@ import pytest
 
 from flows.drives import remove_drive
 from flows.plan import plan_city, record_plan
-from flows.status import SCHEMA, Request, exit_code, show_status, status_of
+from flows.status import SCHEMA, Request, current_status, exit_code, show_status, status_of
 from presight_core.config import load_city_settings
 from presight_core.drives import Drive
-from presight_core.errors import NotFoundError
+from presight_core.errors import InputError, NotFoundError
 from presight_core.progress import Progress
 from storage.catalog import Catalog
 from tests.storage.catalogs import RECIPE, Clock
@@ -60,6 +60,13 @@ def test_one_tile_comes_with_all_its_metrics(catalog):
     assert (tile["tile_id"], tile["metrics"], tile["age_s"]) == ("t000", metrics, pytest.approx(2.0))
 
 
+def test_the_metrics_are_of_the_build_that_is_shown(catalog):
+    catalog.finish_build(catalog.start_build("toytown", "t000", RECIPE), "published", {"loss": 0.5})
+    catalog.finish_build(catalog.start_build("toytown", "t000", RECIPE), "failed", {"loss": 9.0}, "boom")
+    (tile,) = status_of(catalog, "toytown", "t000")["cities"][0]["tiles"]
+    assert (tile["state"], tile["metrics"]) == ("failed", {"loss": 0.5})
+
+
 def test_work_that_belongs_to_no_tile_is_shown_while_it_runs(catalog):
     build_id = catalog.start_build("toytown", "all tiles", RECIPE)
     assert len(status_of(catalog, "toytown")["cities"][0]["tiles"]) == 1
@@ -84,6 +91,12 @@ def test_a_city_or_tile_that_is_none_is_refused(catalog):
         status_of(catalog, "atlantis")
     with pytest.raises(NotFoundError, match="no tile t9"):
         status_of(catalog, "toytown", "t9")
+    with pytest.raises(InputError, match="presight status CITY --tile t000"):
+        status_of(catalog, None, "t000")
+
+
+def test_a_catalog_that_is_still_empty_is_made(tmp_path):
+    assert current_status(f"sqlite:///{tmp_path}/catalog.sqlite")["cities"] == []
 
 
 @pytest.mark.parametrize(
@@ -120,6 +133,15 @@ def test_a_city_is_followed_from_its_plan_to_a_removed_drive(city, capsys):
     (shown,) = json.loads(text)["cities"]
     assert (code, shown["states"], shown["plan_is_outdated"]) == (8, {"stale": 2}, True)
     assert {tile["reasons"] for tile in shown["tiles"]} == {"drive scene-0001 was removed"}
+
+
+def test_the_exit_code_of_a_tile_heeds_no_other_tile(city, capsys):
+    catalog = city.workspace.catalog()
+    catalog.finish_build(catalog.start_build(CITY, "t000", RECIPE), "failed", {}, "boom")
+    catalog.finish_build(catalog.start_build(CITY, "t001", RECIPE), "published", {})
+    codes = [show_status(city.root, Request(CITY, tile, exit_code=True)) for tile in ("t000", "t001", None)]
+    assert codes == [6, 0, 6]
+    assert capsys.readouterr().out
 
 
 def test_watching_ends_when_nothing_runs(city, capsys, monkeypatch):

@@ -27,8 +27,8 @@ features_per_level = 4
 max_resolution = 512
 log2_rows = 12
 [training]
-steps = 40
-batch_rays = 256
+steps = 20
+batch_rays = 128
 [extraction]
 min_hits = 1
 min_density = 0.0
@@ -52,7 +52,7 @@ max_outside = 1.0  # the few streets of this city are short
 def data(tmp_path_factory) -> Path:
     """Four drives on a street each, and a fifth on the street of the first."""
     root = tmp_path_factory.mktemp("data")
-    write_dataset(root, load_preset("ci", [f"towns.{CITY}.{each}" for each in STREETS]), seed=0)
+    write_dataset(root, load_preset("ci", ["keyframes=4", *(f"towns.{CITY}.{each}" for each in STREETS)]), seed=0)
     return root
 
 
@@ -107,9 +107,9 @@ def test_only_the_tiles_that_the_drive_touches_are_built_and_the_others_stay_to_
 def test_the_tiles_went_on_from_their_fields_and_say_so(updated):
     workspace, plan = updated
     for tile in (tile for tile in plan["tiles"] if tile["stale"]):
-        assert tile["warm_steps"] == 16  # of 40
+        assert tile["warm_steps"] == 8  # of 20
         begun = generation(workspace, 2).tiles[tile["tile_id"]].recipe["inputs"]["training"]["inputs"]["warm_start"]
-        assert begun["steps"] == 16
+        assert begun["steps"] == 8
         folder = workspace.scratch(CITY, tile["tile_id"], begun["training"])
         assert (folder / "field" / "field.safetensors").exists()
 
@@ -120,7 +120,7 @@ def test_the_new_drive_is_in_the_prior(updated):
     assert drive.drive_id in PriorReader.open(workspace.store_location, CITY).drive_names
     world_from_ego = np.eye(4)
     world_from_ego[:3, 3] = workspace.drives().frames(drive.drive_id).positions.mean(0)
-    views = {"x_m": (-20, 20), "y_m": (-20, 20), "z_m": (-600, 600)}
+    views = {"x_m": (-2000, 2000), "y_m": (-2000, 2000), "z_m": (-600, 600)}
     reader = PriorReader.open(workspace.store_location, CITY)
     others = [each.drive_id for each in workspace.catalog().drives(CITY) if each != drive]
     assert len(reader.window(world_from_ego, **views, without_drives=others)) > 0

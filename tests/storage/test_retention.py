@@ -1,12 +1,13 @@
 """Garbage collection: what nobody needs goes, and nothing else."""
 
+import shutil
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
 
 from presight_core.errors import InputError, NotFoundError, StoreError
-from presight_core.priors import PriorReader
+from presight_core.priors import CollectedError, PriorReader
 from storage.retention import Retention, collect, find_garbage
 from storage.verification import verify_city
 
@@ -77,6 +78,34 @@ def test_looking_for_garbage_removes_nothing(rebuilt):
     found = find_garbage(rebuilt.location, "town", KEEP_ONE, later())
     assert found.generations == (1, 2)
     assert builds(rebuilt) == ["build-1", "build-2", "build-3"]
+
+
+def test_a_reader_of_what_was_collected_is_told_so(rebuilt):
+    pinned = rebuilt.reader(1)
+    collect(rebuilt.location, "town", KEEP_ONE, later())
+    with pytest.raises(CollectedError, match="generation 1 was removed while it was read; open the newest one"):
+        pinned.window(np.eye(4))
+
+
+def test_what_is_lost_without_a_collection_is_damage(rebuilt):
+    shutil.rmtree(rebuilt.location / "town/tiles/t000/build-3")
+    with pytest.raises(StoreError, match="missing, though a generation shows it"):
+        rebuilt.reader(3).window(np.eye(4))
+
+
+def test_no_folder_stays_of_what_was_collected(rebuilt):
+    collect(rebuilt.location, "town", KEEP_ONE, later())
+    assert [folder.name for folder in (rebuilt.location / "town/tiles/t000").iterdir()] == ["build-3"]
+
+
+def test_an_unfinished_document_is_no_tag_and_no_generation(rebuilt):
+    for place in ("tags/draft.json#1", "generations/00000004.json#7"):
+        (rebuilt.location / "town" / place).parent.mkdir(exist_ok=True)
+        (rebuilt.location / "town" / place).write_bytes(b"ha")
+    assert rebuilt.store.tags("town") == {}
+    assert rebuilt.store.generations("town") == [1, 2, 3]
+    assert verify_city(rebuilt.location, "town").faults == []
+    assert collect(rebuilt.location, "town", KEEP_ONE, later()).generations == (1, 2)
 
 
 def test_a_damaged_history_stops_it(rebuilt):

@@ -6,6 +6,7 @@ The parent itself never touches a store: the threads of the object store's libra
 import io
 import json
 import os
+import select
 import signal
 import sys
 import time
@@ -48,6 +49,10 @@ class Child:
         with os.fdopen(self.output, "rb") as pipe:
             lines = pipe.read().decode().splitlines()
         return os.waitstatus_to_exitcode(ended[1]), [json.loads(line) for line in lines]
+
+    def until_said(self) -> None:
+        """Wait until it has acknowledged something, or ended."""
+        select.select([self.output], [], [], PATIENCE_S)
 
     def signal(self, number: int) -> None:
         """Send it a signal."""

@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,17 @@ from tests.torture import children
 from tests.torture.toy_city import ToyCity
 
 LONG = "PRESIGHT_TORTURE"
+
+# What the pipeline imports when it first needs it: each child would do so anew, and spend half of its time there.
+for late in (
+    "pyarrow.dataset",
+    "rich._emoji_codes",
+    "safetensors.numpy",
+    "sqlalchemy.dialects.sqlite",
+    "storage.artifacts",
+    "storage.migrations.upgrade",
+):
+    import_module(late)
 
 
 @pytest.fixture(scope="session")

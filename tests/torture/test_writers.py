@@ -1,15 +1,19 @@
 """Row R7 of docs/reliability.md: writers, readers and a run that was taken for dead, all in processes of their own."""
 
+from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
+from uuid import uuid4
 
+import numpy as np
 import pytest
 
 from flows import reconcile
 from presight_core.priors.documents import GenerationTile
 from presight_core.priors.example import ExampleTile
-from presight_core.priors.reader import PriorReader
+from presight_core.priors.reader import CollectedError, PriorReader
 from storage.priors import PriorStore
+from storage.retention import Retention, collect
 from storage.tile_groups import TileName
 from tests.torture import children
 from tests.torture.conftest import whole_run
@@ -103,6 +107,67 @@ def test_eight_writers_of_a_folder_lose_nothing(tmp_path, is_long):
 
 def test_eight_writers_of_an_s3_store_lose_nothing(s3, tmp_path, is_long):
     in_parallel(s3, 1000 if is_long else 104, tmp_path / "log")
+
+
+def read_pinned(location: str, acknowledge) -> None:
+    """Read windows of the newest generation until it is collected; each is what was written, bit for bit."""
+    reader = PriorReader.open(location, CITY, cache_bytes=0)  # nothing is kept: every window reads the disk
+    truth = window_of(reader)
+    acknowledge("pinned")
+    count = 0
+    while True:
+        try:
+            found = window_of(reader)
+        except CollectedError as error:
+            acknowledge([count, str(error)])
+            return
+        assert all(np.array_equal(first, second) for first, second in zip(found, truth, strict=True))
+        count += 1
+
+
+def window_of(reader: PriorReader) -> list:
+    window = reader.window(np.eye(4), (-60, 60), (-60, 60), (-90, 90))
+    assert len(window) > 0
+    return [window.points_world, window.features, window.hits, window.observed]
+
+
+def replace_and_collect(location: str, grace: timedelta, acknowledge) -> None:
+    """Publish another build in the place of what is shown, and collect."""
+    store = PriorStore.open(location)
+    entry = store.write_tile(CITY, TileName("t000", uuid4().hex), EXAMPLE.batches(), ["a", "b", "c"], {})
+    number = store.publish(CITY, {"t000": GenerationTile(entry, {"build": entry.path})}, store.generations(CITY)[-1])
+    garbage = collect(location, CITY, Retention(keep=1, grace=grace), datetime.now(UTC))
+    acknowledge([number, len(garbage.generations), len(garbage.builds)])
+
+
+@pytest.mark.parametrize("place", ["folder", "s3"])
+def test_what_is_collected_while_it_is_read_is_true_or_said_to_be_gone(place, tmp_path, request):
+    location = str(tmp_path / "store") if place == "folder" else request.getfixturevalue("s3")
+    log, none = tmp_path / "log", timedelta(0)
+    children.result(lambda: make_city(location), log)
+    assert children.run(lambda say: replace_and_collect(location, none, say), log)[0] == 0
+    readers = [children.start(lambda say: read_pinned(location, say), log) for _ in range(4)]
+    for reader in readers:
+        reader.until_said()
+    (collected,) = children.run(lambda say: replace_and_collect(location, none, say), log)[1]
+    assert collected == [3, 1, 1], log.read_text()
+    for code, said in [reader.wait() for reader in readers]:
+        assert code == 0, log.read_text()
+        assert "generation 2 was removed while it was read" in said[-1][1]
+
+
+def test_nobody_is_disturbed_within_the_grace_period(tmp_path):
+    location, week = str(tmp_path / "store"), timedelta(days=7)
+
+    def work(acknowledge) -> None:
+        make_city(location)
+        replace_and_collect(location, week, acknowledge)
+        reader = PriorReader.open(location, CITY, cache_bytes=0)
+        truth = window_of(reader)
+        replace_and_collect(location, week, acknowledge)
+        assert all(np.array_equal(*pair) for pair in zip(window_of(reader), truth, strict=True))
+
+    assert children.run(work, tmp_path / "log") == (0, [[2, 0, 0], [3, 0, 0]]), (tmp_path / "log").read_text()
 
 
 def test_eight_runs_of_one_city_build_it_once(city, truth):
