@@ -1,7 +1,7 @@
 """What a Prefect server is told of a city: its deployments, their schedules, and what starts by itself.
 
-A deployment is registered as FLOW/CITY. Rebuilds and updates of a city share one slot of the server, so that a second
-one waits without a process of its own; that nothing is built twice is the lease's doing (docs/decisions/014).
+A deployment is registered as FLOW/CITY. Rebuilds and updates of a city share a work queue that lets few of them begin;
+that one builds at a time, and nothing twice, is the lease's doing (docs/decisions/014).
 """
 
 from collections.abc import Iterator
@@ -14,13 +14,13 @@ from prefect.utilities.callables import parameter_schema
 from prefect.utilities.importtools import import_object
 
 from flows.prefect_settings import require_server
-from flows.schedules import AFTER_INGEST, FLOWS, ONE_AT_A_TIME, Schedules
+from flows.schedules import AFTER_INGEST, BUILDING, FLOWS, Schedules
 from presight_core.errors import ConflictError, SettingsError
 from storage.workspace import Workspace
 
 TAG = "presight"
 ON_INGEST_TAG = "on-ingest"
-SLOT_GRACE_S = 60  # after which Prefect gives the slot of a dead run to the next; the least that it accepts
+BEGUN_AT_ONCE = 2  # runs of a city: one builds, one waits for its lease, or Prefect takes it to run though it is lost
 
 
 def register(workspace: Workspace, city: str, schedules: Schedules) -> list[dict[str, Any]]:
@@ -31,8 +31,8 @@ def register(workspace: Workspace, city: str, schedules: Schedules) -> list[dict
     with _server() as server:
         _require_own(workspace, _registered(server, city))
         _ensure(server, "/work_pools/", {"name": schedules.pool, "type": "process"})
-        slot = _ensure(server, "/v2/concurrency_limits/", {"name": _slot_name(city), "limit": 1})
-        return [_register(server, workspace, city, flow, schedules, slot["id"]) for flow in FLOWS]
+        _ensure(server, f"/work_pools/{schedules.pool}/queues/", {"name": city, "concurrency_limit": BEGUN_AT_ONCE})
+        return [_register(server, workspace, city, flow, schedules) for flow in FLOWS]
 
 
 def remove(workspace: Workspace, city: str) -> list[str]:
@@ -42,8 +42,8 @@ def remove(workspace: Workspace, city: str) -> list[str]:
         _require_own(workspace, known)
         for deployment in known.values():
             server.request("DELETE", f"/deployments/{deployment['id']}")
-        with _ignoring(404):
-            server.request("DELETE", f"/v2/concurrency_limits/{_slot_name(city)}")
+            with _ignoring(404):
+                server.request("DELETE", f"/work_pools/{deployment['work_pool_name']}/queues/{city}")
         return list(known)
 
 
@@ -61,20 +61,14 @@ def start_after_ingest(workspace: Workspace, cities: list[str]) -> dict[str, str
     return runs
 
 
-def _register(
-    server: Any, workspace: Workspace, city: str, flow: str, schedules: Schedules, slot: str
-) -> dict[str, Any]:
+def _register(server: Any, workspace: Workspace, city: str, flow: str, schedules: Schedules) -> dict[str, Any]:
     cron = schedules.crons.get(flow)
     flow_id = server.request("POST", "/flows/", json={"name": flow}).json()["id"]
     starts_on_ingest = schedules.on_ingest and flow == AFTER_INGEST
     parameters = {"workspace": str(workspace.root), "city": city}
-    if flow in ONE_AT_A_TIME:
+    if flow in BUILDING:
         parameters |= {"runner": schedules.machines.runner, "cluster": schedules.machines.cluster}
     timing = {"schedule": {"cron": cron, "timezone": schedules.timezone}, "active": True}
-    limit = {
-        "global_concurrency_limit_id": slot,
-        "concurrency_options": {"collision_strategy": "ENQUEUE", "grace_period_seconds": SLOT_GRACE_S},
-    }
     asked = {
         "name": city,
         "flow_id": flow_id,
@@ -84,7 +78,7 @@ def _register(
         "parameter_openapi_schema": parameter_schema(import_object(FLOWS[flow])).model_dump(mode="json"),
         "schedules": [timing] if cron else [],
         "tags": [TAG, ON_INGEST_TAG] if starts_on_ingest else [TAG],
-        **(limit if flow in ONE_AT_A_TIME else {}),
+        **({"work_queue_name": city} if flow in BUILDING else {}),
     }
     server.request("POST", "/deployments/", json=asked)
     when = {"cron": cron, "timezone": schedules.timezone if cron else None, "on_ingest": starts_on_ingest}
@@ -113,11 +107,10 @@ def _require_own(workspace: Workspace, known: dict[str, dict[str, Any]]) -> None
             )
 
 
-def _ensure(server: Any, path: str, value: dict[str, Any]) -> dict[str, Any]:
-    """What has this name on the server, made if there is none."""
+def _ensure(server: Any, path: str, value: dict[str, Any]) -> None:
+    """Make it on the server, unless something has its name."""
     with _ignoring(409):
-        return server.request("POST", path, json=value).json()
-    return server.request("GET", path + value["name"]).json()
+        server.request("POST", path, json=value)
 
 
 def _waiting(server: Any, deployment_id: str) -> str | None:
@@ -133,10 +126,6 @@ def _waiting(server: Any, deployment_id: str) -> str | None:
 def _start(server: Any, deployment_id: str) -> str:
     state = {"type": "SCHEDULED", "name": "Scheduled"}
     return server.request("POST", f"/deployments/{deployment_id}/create_flow_run", json={"state": state}).json()["id"]
-
-
-def _slot_name(city: str) -> str:
-    return f"presight-{city}"
 
 
 @contextmanager

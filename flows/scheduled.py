@@ -1,7 +1,6 @@
 """The flows that a schedule or an event starts. Their parameters are references and settings of the run, never data.
 
-A run that Prefect cancels, or that dies, is ended in the catalog at once where its worker lives; else by whoever
-looks next (docs/decisions/009).
+A run that Prefect cancels ends itself in the catalog; one that dies is ended by who looks next (docs/decisions/009).
 """
 
 from datetime import UTC, datetime, timedelta
@@ -18,21 +17,13 @@ from storage.retention import Retention, collect
 from storage.workspace import Workspace
 
 
-def end_in_catalog(_flow: Any, run: Any, _state: Any) -> None:
-    """Let the catalog know that a run is over which could not say so itself."""
-    reconcile(Workspace.open(Path(run.parameters["workspace"])), run.parameters["city"])
-
-
-ENDINGS: Any = {"on_crashed": [end_in_catalog], "on_cancellation": [end_in_catalog], "persist_result": False}
-
-
-@flow(name="rebuild", flow_run_name="rebuild {city}", **ENDINGS)
+@flow(name="rebuild", flow_run_name="rebuild {city}", persist_result=False)
 def rebuild(workspace: str, city: str, runner: str = "threads", cluster: str = "", wait: bool = True) -> dict[str, Any]:
     """Build and publish what is stale of a city, as `presight build`. Raises BuildError if a tile failed."""
     return _built(workspace, Request(city, machines=Machines(runner, cluster), wait=wait))
 
 
-@flow(name="update", flow_run_name="update {city}", **ENDINGS)
+@flow(name="update", flow_run_name="update {city}", persist_result=False)
 def update(workspace: str, city: str, runner: str = "threads", cluster: str = "", wait: bool = True) -> dict[str, Any]:
     """The same as `presight update`: tiles go on from the fields that they have."""
     return _built(workspace, Request(city, machines=Machines(runner, cluster), wait=wait, warm=True))

@@ -13,7 +13,7 @@ FLOWS = {  # and where a worker finds them
     "reconcile": "flows.scheduled.reconcile_city",
     "gc": "flows.scheduled.collect_garbage",
 }
-ONE_AT_A_TIME = ("rebuild", "update")  # these build; the others may run beside them
+BUILDING = ("rebuild", "update")  # the others may run beside them
 UNNAMED = "rebuild"  # the flow of a cron without a name
 AFTER_INGEST = "update"
 

@@ -86,10 +86,10 @@ def s3_server() -> Iterator[dict[str, str]]:
 
 
 class PrefectServer:
-    """A Prefect server on loopback, one process, all of it in one folder; it may be killed and come back."""
+    """A Prefect server on loopback, one process; it may be killed and come back."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder, (self._port,) = folder, free_ports(1)
+    def __init__(self, folder: Path, database: str) -> None:
+        self._folder, self._database, (self._port,) = folder, database, free_ports(1)
         self.url = f"http://127.0.0.1:{self._port}/api"
         self.environment = {
             "PREFECT_API_URL": self.url,
@@ -102,9 +102,13 @@ class PrefectServer:
 
     def start(self) -> None:
         """Start it, and wait until it answers."""
-        quick = {"SERVER_UI_ENABLED": "false", "SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2"}
-        quick["SERVER_DEPLOYMENTS_CONCURRENCY_SLOT_WAIT_SECONDS"] = "5"  # SQLite does not take more questions well
-        environment = {**os.environ, **self.environment, **{f"PREFECT_{name}": text for name, text in quick.items()}}
+        own = {
+            "DATABASE_CONNECTION_URL": self._database.replace("+psycopg:", "+asyncpg:"),
+            "UI_ENABLED": "false",
+            "SERVICES_SCHEDULER_LOOP_SECONDS": "2",
+            "DEPLOYMENTS_CONCURRENCY_SLOT_WAIT_SECONDS": "5",
+        }
+        environment = {**os.environ, **self.environment, **{f"PREFECT_SERVER_{name}": own[name] for name in own}}
         app = ["--factory", "prefect.server.api.server:create_app", "--host", "127.0.0.1", "--port", str(self._port)]
         command = [sys.executable, "-m", "uvicorn", *app, "--timeout-graceful-shutdown", "5"]
         with (self._folder / "server.log").open("ab") as log:
@@ -132,9 +136,9 @@ class PrefectServer:
 
 
 @contextmanager
-def prefect_server(folder: Path) -> Iterator[PrefectServer]:
-    """A running Prefect server that keeps its database in `folder`."""
-    server = PrefectServer(folder)
+def prefect_server(folder: Path, database: str) -> Iterator[PrefectServer]:
+    """A running Prefect server with a PostgreSQL at this URL: SQLite is often locked for a minute."""
+    server = PrefectServer(folder, database)
     try:
         server.start()
         yield server

@@ -12,6 +12,7 @@ import pytest
 
 from tests.flows.scheduler import Scheduler
 from tests.servers import prefect_server
+from tests.storage.catalogs import new_postgres
 from tests.torture.toy_city import ToyCity
 
 Presight = Callable[..., subprocess.CompletedProcess[str]]
@@ -65,10 +66,10 @@ def new_city(new_city_template: ToyCity, tmp_path: Path) -> ToyCity:
 
 
 @pytest.fixture(scope="session")
-def scheduler(tmp_path_factory) -> Iterator[Scheduler]:
+def scheduler(postgres: str, tmp_path_factory) -> Iterator[Scheduler]:
     """A real Prefect server; a worker starts with the first test that needs one."""
     folder = tmp_path_factory.mktemp("prefect")
-    with prefect_server(folder) as server:
+    with prefect_server(folder, new_postgres(postgres, "prefect")) as server:
         made = Scheduler(server, folder)
         try:
             yield made

@@ -57,6 +57,11 @@ def ingested_again(scheduler: Scheduler, city: ToyCity, scene: str) -> list[str]
     return list(json.loads(result.stdout)["started"].values())
 
 
+def of_type(scheduler: Scheduler, state: str) -> list[str]:
+    """The runs of the rebuild that are in such a state."""
+    return [run["id"] for run in scheduler.runs(REBUILD) if run["state_type"] == state]
+
+
 def check_built_once(city: ToyCity) -> None:
     """One generation, made of what was built once, and a catalog that agrees with it."""
     city.check_catalog()
@@ -71,32 +76,35 @@ def check_ended(city: ToyCity) -> None:
     assert catalog.running(CITY) == []
     assert catalog.leases.current(CITY) is None
     assert {build.state for build in catalog.builds(CITY) if build.tile_id != "all tiles"} == {"failed"}
-    assert city.workspace.store().generations(CITY) == []
+    assert city.check() == {}, "nothing is shown; whoever ends a lost run may have put a generation that fences it out"
 
 
 def check_next_run(city: ToyCity) -> None:
     """The next run makes the city, and nothing was built twice into it."""
     release(city)
-    assert city.build() == 1
+    city.build()
     city.check_catalog()
+    assert sorted(city.check()) == ["t000", "t001"]
 
 
-def test_a_schedule_builds_the_city_and_its_second_run_waits_for_the_first(forgetful, new_city):
+def test_a_schedule_builds_the_city_and_its_second_run_waits_and_its_third_does_not_begin(forgetful, new_city):
     scheduler = forgetful
     (new_city.root / "hold").touch()
-    result = scheduler.presight(new_city.root, "deploy", CITY, "--cron", "* * * * * */30", "--json")
+    result = scheduler.presight(new_city.root, "deploy", CITY, "--cron", "* * * * *", "--json")
     registered = {row["deployment"]: row for row in json.loads(result.stdout)}
     machines = {"runner": "threads", "cluster": ""}
     assert registered[REBUILD]["parameters"] == {"workspace": str(new_city.root), "city": CITY, **machines}
     scheduler.start_worker()
-    first, second = eventually(lambda: scheduler.runs(REBUILD)[:2])
+    (first, *_) = eventually(lambda: scheduler.runs(REBUILD))
     assert first["auto_scheduled"]
     assert first["parameters"] == registered[REBUILD]["parameters"], "references are all that a run is given"
     scheduler.until(first["id"], "RUNNING")
-    eventually(lambda: scheduler.state(second["id"])["name"] == "AwaitingConcurrencySlot")
+    for _ in range(2):
+        scheduler.start(REBUILD)
+    begun = eventually(lambda: len(runs := of_type(scheduler, "RUNNING")) == 2 and runs)
+    assert of_type(scheduler, "PENDING") == [], "the third one holds no process"
     release(new_city)
-    assert scheduler.until(first["id"])["type"] == "COMPLETED"
-    assert scheduler.until(second["id"])["type"] == "COMPLETED"
+    assert [scheduler.until(run)["type"] for run in begun] == ["COMPLETED", "COMPLETED"]
     check_built_once(new_city)
     assert scheduler.presight(new_city.root, "deploy", CITY, "--remove").returncode == 0
     assert scheduler.presight(new_city.root, "deploy", CITY, "--remove").stdout == f"{CITY}: nothing removed\n"
@@ -121,22 +129,21 @@ def test_a_cancelled_run_is_ended_in_the_catalog(deployed, new_city):
     check_next_run(new_city)
 
 
-def test_a_killed_run_is_ended_in_the_catalog(deployed, new_city):
+def test_a_killed_run_is_ended_in_the_catalog_by_reconcile(deployed, new_city):
     run, process = started(deployed, new_city)
     os.kill(process, signal.SIGKILL)
     assert deployed.until(run)["type"] == "CRASHED"
-    eventually(lambda: not new_city.workspace.catalog().running(CITY))
+    assert deployed.presight(new_city.root, "reconcile").returncode == 0
     check_ended(new_city)
     check_next_run(new_city)
 
 
-def test_a_run_outlives_its_killed_worker_and_the_next_worker_builds_nothing_twice(deployed, new_city):
-    run, _ = started(deployed, new_city)
+def test_a_run_whose_worker_is_killed_ends_itself_in_the_catalog(deployed, new_city):
+    started(deployed, new_city)
     deployed.end_worker(signal.SIGKILL)
-    deployed.start_worker()
-    release(new_city)
-    assert deployed.until(run)["type"] == "COMPLETED"
-    check_built_once(new_city)
+    eventually(lambda: not new_city.workspace.catalog().running(CITY))
+    check_ended(new_city)
+    check_next_run(new_city)
 
 
 def test_a_run_outlives_the_killed_server_and_the_next_run_builds_nothing_twice(deployed, new_city):
