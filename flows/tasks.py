@@ -25,7 +25,8 @@ def only_time_can_cure(_task: Any, _run: Any, state: Any) -> bool:
 
 QUEUED = Progress("", 0, 0)  # nobody works on it
 
-# The catalog holds the truth, so Prefect neither caches nor persists results.
+# The catalog holds the truth, so Prefect neither caches nor persists results. No task has tags: one that has asks the
+# server for leave before it starts, and a run that has begun shall go on without its server.
 OPTIONS: dict[str, Any] = {
     "cache_policy": NO_CACHE,
     "persist_result": False,
@@ -34,19 +35,19 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-@task(name="fit-space", tags=["cpu"], **OPTIONS)
+@task(name="fit-space", **OPTIONS)
 def fit_space(job: Job) -> dict[str, Any]:
     """Fit and freeze the feature space of the job's models."""
     return _work("fit-space", job)
 
 
-@task(name="extract-features", task_run_name="features of {job.drive_ids[0]}", tags=["cpu"], **OPTIONS)
+@task(name="extract-features", task_run_name="features of {job.drive_ids[0]}", **OPTIONS)
 def extract_features(job: Job) -> dict[str, Any]:
     """Label maps and features of one drive, into the cache."""
     return _work("features", job)
 
 
-@task(name="train-tile", task_run_name="train {job.tile_id}", tags=["gpu"], **OPTIONS)
+@task(name="train-tile", task_run_name="train {job.tile_id}", **OPTIONS)
 def train_tile(job: Job) -> dict[str, Any]:
     """Train and evaluate one tile's field."""
     trained = _work("train", job)
@@ -54,7 +55,7 @@ def train_tile(job: Job) -> dict[str, Any]:
     return trained
 
 
-@task(name="extract-tile", task_run_name="extract {job.tile_id}", tags=["gpu"], **OPTIONS)
+@task(name="extract-tile", task_run_name="extract {job.tile_id}", **OPTIONS)
 def extract_tile(job: Job) -> dict[str, Any]:
     """Turn one tile's field into voxels, written but not yet published."""
     return _work("extract", job)
