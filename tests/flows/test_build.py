@@ -120,7 +120,7 @@ def test_a_failed_tile_keeps_its_old_state_and_does_not_sink_the_city(built, pre
     """Comes last: it publishes generation 2."""
     (field,) = (built.caches / "scratch" / CITY / "t001").glob("*/field/field.safetensors")
     field.write_bytes(field.read_bytes()[:100])
-    other_rays = "--set", "extraction.pixel_stride=7", "--accept", "t000"  # a field of 40 steps differs too much by them
+    other_rays = "--set", "extraction.pixel_stride=7", "--accept", "t000"  # 40 steps differ too much by them
     result = presight(built.root, "build", CITY, *other_rays)
     assert result.returncode == 6
     assert "t000: failed" not in result.stdout, result.stdout
