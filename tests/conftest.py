@@ -24,6 +24,13 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def seeded_torch() -> None:
+    """Every test draws the same numbers, whichever tests ran before it."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(0)
+
+
 @pytest.fixture
 def tiny(tmp_path: Path) -> TinyDataset:
     """A sound data set in the nuScenes format, not yet written."""

@@ -61,9 +61,8 @@ class ReadLocation:
         try:
             if isinstance(self._place, Path):
                 entries = (self._place / folder).iterdir()
-                return sorted(
-                    entry.name for entry in entries if entry.is_file() and "#" not in entry.name
-                )  # unfinished
+                # With a # in its name a file is an unfinished write.
+                return sorted(entry.name for entry in entries if entry.is_file() and "#" not in entry.name)
             objects = obstore.list_with_delimiter(self._place, folder)["objects"]
             # Some servers list a folder that was emptied as an object of the folder's own name.
             paths = [entry["path"] for entry in objects if entry["path"].startswith(f"{folder}/")]

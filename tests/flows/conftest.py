@@ -33,23 +33,6 @@ def presight(tmp_path_factory) -> Presight:
 
 
 @pytest.fixture(scope="session")
-def city_template(tmp_path_factory) -> ToyCity:
-    """A city of two drives, both in its two published tiles."""
-    folder = tmp_path_factory.mktemp("city")
-    made = ToyCity(folder / "workspace", folder / "data", side_blocks=2)
-    made.prepare()
-    made.ingest()
-    assert made.build() == 1
-    return made
-
-
-@pytest.fixture
-def city(city_template: ToyCity, tmp_path: Path) -> ToyCity:
-    """A copy of the city that a test may change."""
-    return replace(city_template, root=Path(shutil.copytree(city_template.root, tmp_path / "workspace")))
-
-
-@pytest.fixture(scope="session")
 def new_city_template(tmp_path_factory) -> ToyCity:
     """A city of two drives that was never built."""
     folder = tmp_path_factory.mktemp("new-city")
@@ -59,10 +42,29 @@ def new_city_template(tmp_path_factory) -> ToyCity:
     return made
 
 
+@pytest.fixture(scope="session")
+def city_template(new_city_template: ToyCity, tmp_path_factory) -> ToyCity:
+    """The same city, both drives in its two published tiles."""
+    made = copied(new_city_template, tmp_path_factory.mktemp("city"))
+    assert made.build() == 1
+    return made
+
+
+@pytest.fixture
+def city(city_template: ToyCity, tmp_path: Path) -> ToyCity:
+    """A copy of the built city that a test may change."""
+    return copied(city_template, tmp_path)
+
+
 @pytest.fixture
 def new_city(new_city_template: ToyCity, tmp_path: Path) -> ToyCity:
-    """A copy of the city that a test may build."""
-    return replace(new_city_template, root=Path(shutil.copytree(new_city_template.root, tmp_path / "workspace")))
+    """A copy of the new city that a test may build."""
+    return copied(new_city_template, tmp_path)
+
+
+def copied(city: ToyCity, folder: Path) -> ToyCity:
+    """The city with a workspace of its own below the folder; its images stay where they are."""
+    return replace(city, root=Path(shutil.copytree(city.root, folder / "workspace")))
 
 
 @pytest.fixture(scope="session")
