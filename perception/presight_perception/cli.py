@@ -34,6 +34,9 @@ def experiment(  # noqa: PLR0913, PLR0917 - a command's options
     store: Annotated[
         str, typer.Option(help="Folder or URL of the priors, WORKSPACE/store of presight.", show_default=False)
     ],
+    colours_store: Annotated[
+        str, typer.Option(help="The same for priors with the features `colours`, a row of `features`.")
+    ] = "",
     version: Annotated[str, typer.Option(help="Folder of the data set's tables.")] = "v1.0-trainval",
     out: Annotated[Path, typer.Option(help="Folder of runs and results; an interrupted experiment goes on.")] = Path(
         "experiments"
@@ -47,7 +50,9 @@ def experiment(  # noqa: PLR0913, PLR0917 - a command's options
     """Train and try models with and without prior, and write a table with pictures."""
     from presight_perception.experiment.command import ExperimentOrder, run_experiment
 
-    order = ExperimentOrder(name, data, version, store, out, model or None, seeds, steps, test_stride, parallel)
+    order = ExperimentOrder(
+        name, data, version, store, colours_store or None, out, model or None, seeds, steps, test_stride, parallel
+    )
     print(f"look at {run_experiment(order)}")
 
 

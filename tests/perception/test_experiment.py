@@ -225,6 +225,24 @@ def test_the_best_constant_mask_is_what_all_truths_share(material: Material) -> 
     assert "day" not in figures
 
 
+def test_colours_are_a_prior_of_a_store_of_their_own(locations: Locations, material: Material, tmp_path: Path) -> None:
+    publish(tmp_path / "colours", "build-2", None, drive_names={"drive-0": toy_dataset.TRAIN_SCENE})
+    both = Material(replace(locations, colours_store=str(tmp_path / "colours")))
+    assert both.prior_digest("colours") != both.prior_digest("presight")
+    assert both.voxel_channels("colours") == 4 + both.colour_priors.channel_count
+    run, task = Run("raster", "colours"), task_of("raster", locations)
+    seen = both.test_prior(run, Probe(), task.prior_grid)
+    assert seen is not None
+    assert seen.priors is both.colour_priors
+    with pytest.raises(InputError, match="no store has the features `colours`; build one with --set features"):
+        material.prior_digest("colours")
+
+
+def test_the_table_of_features_has_colours_where_there_are_such_priors() -> None:
+    labels = [{row.label for row in rows_of("features", Scope(colours=colours))} for colours in (False, True)]
+    assert labels[1] - labels[0] == {"raster, colour statistics"}
+
+
 def test_ground_is_mapped_where_the_prior_has_something_under_the_vehicle(material: Material) -> None:
     here, there = material.test[0], replace(material.test[0], world_from_ego=planar_transform(500.0, 0.0, 0.0))
     assert (material.is_mapped(here), material.is_mapped(there)) == (True, False)
@@ -274,6 +292,7 @@ def test_a_job_ends_when_nobody_waits_for_it(
 def test_every_kind_of_model_is_trained_and_tried(model, prior, locations: Locations, tmp_path: Path) -> None:
     figures = do_job(Job(Run(model, prior, schedule=SCHEDULE), (Probe(),), locations, tmp_path))[0]
     assert 0 <= figures["all"]["mean"] <= 100
+    assert figures["all"]["fps"] > 0
     assert ("static" in figures["all"]) == (model == "bevdet-occ")
 
 
@@ -308,8 +327,8 @@ def test_a_report_shows_means_and_spreads_over_seeds(tmp_path: Path) -> None:
 
     outcomes = [outcome(0, 10.0), outcome(1, 14.0)]
     columns, lines = table_of(outcomes)
-    assert columns == ["", "mean", "ped_crossing", "divider", "boundary", "mean, night", "seeds"]
-    assert lines == [["raster", *["12.0 ± 2.8"] * 5, "2"]]
+    assert columns == ["", "mean", "ped_crossing", "divider", "boundary", "mean, night", "frames/s", "seeds"]
+    assert lines == [["raster", *["12.0 ± 2.8"] * 5, "", "2"]]  # nobody timed these
     page = write_report("headline", outcomes, [], {"steps": 3}, tmp_path)
     assert "12.0 ± 2.8" in page.read_text()
     assert "| raster | 12.0 ± 2.8 |" in (tmp_path / "table.md").read_text()

@@ -43,6 +43,7 @@ class ExperimentOrder:
     data: Path
     version: str
     store: str
+    colours_store: str | None
     out: Path
     model: str | None
     seeds: int
@@ -55,8 +56,11 @@ def run_experiment(order: ExperimentOrder) -> Path:
     """The page with the results. Raises InputError for an unknown experiment or model, and for unusable data."""
     if order.model is not None and order.model not in get_args(ModelName):
         raise InputError(f"no model is named {order.model!r}; choose one of: {', '.join(get_args(ModelName))}")
-    locations = Locations(order.data, order.version, order.store, test_stride=order.test_stride)
-    scope = Scope(order.seeds, Schedule(order.steps), order.model)  # pyright: ignore[reportArgumentType] - checked above
+    locations = Locations(
+        order.data, order.version, order.store, test_stride=order.test_stride, colours_store=order.colours_store
+    )
+    model: ModelName | None = order.model  # pyright: ignore[reportAssignmentType] - checked above
+    scope = Scope(order.seeds, Schedule(order.steps), model, colours=order.colours_store is not None)
     rows = rows_of(order.name, scope)
     runs = order.out / "runs"
     with _bars(runs) as report:
@@ -114,6 +118,8 @@ def _facts(material: Material, scope: Scope) -> dict:
         "feature space": material.priors.space_id,
         "steps": scope.schedule.steps,
         "spread": "standard deviation over seeds",
+        "frames/s": "of one processor core's own time: a window of the prior read, voxelised, the model, its output "
+        "decoded; images were decoded before",
         "features of the prior": "those of its feature space; of the shipped tiny networks they were learned with the "
         "embedded city's own classes, which flatters them",
     }

@@ -20,6 +20,7 @@ from presight_perception.models.camera_rig import CameraRig
 from presight_perception.voxelise import VoxelGrid
 
 WITHOUT_VOXELS: tuple[PriorKind, ...] = ("none", "nmp")
+WITHOUT_FEATURES: tuple[PriorKind, ...] = ("geometry", "lidar")
 GEOMETRY_CHANNELS = 4  # of a voxel: its place and its hits
 AT_THE_VEHICLE_M = -5.0, 5.0
 HEIGHTS_M = -3.0, 5.0
@@ -35,6 +36,7 @@ class Locations:
     store: str  # of the priors: folder or URL
     image_size: ImageSize = field(default_factory=ImageSize)
     test_stride: int = 2  # every so many-th keyframe of a test drive is tried: neighbours look alike
+    colours_store: str | None = None  # of priors with the features `colours`
 
 
 class Material:
@@ -66,19 +68,21 @@ class Material:
 
         Raises InputError if a test city has none.
         """
-        generations = {}
-        for city in sorted({keyframe.city for keyframe in self.keyframes}):
-            try:
-                generations[city] = PriorReader.open(self.locations.store, city).generation.number
-            except NotFoundError:
-                continue
-        missing = {keyframe.city for keyframe in self.test} - generations.keys()
-        if missing:
+        return self._open(self.locations.store)
+
+    @cached_property
+    def colour_priors(self) -> CityPriors:
+        """The same with features that nothing was learned for. Raises InputError also if no store of them is named."""
+        if self.locations.colours_store is None:
             raise InputError(
-                f"{self.locations.store} has no prior of {', '.join(sorted(missing))}; "
-                f"build it: presight ingest {self.locations.data} --no-tests --no-nights, then presight build CITY"
+                "no store has the features `colours`; build one with --set features.feature_model=colours in a "
+                "workspace of its own, and name it: --colours-store WORKSPACE/store"
             )
-        return CityPriors(self.locations.store, generations)
+        return self._open(self.locations.colours_store)
+
+    def priors_of(self, kind: PriorKind) -> CityPriors:
+        """What runs of a kind see, or a LiDAR history of the same drives is made for."""
+        return self.colour_priors if kind == "colours" else self.priors
 
     @cached_property
     def lidar_history(self) -> LidarHistory:
@@ -94,13 +98,13 @@ class Material:
 
     def prior_digest(self, kind: PriorKind) -> str:
         """Names the prior that runs of a kind see."""
-        return "" if kind == "none" else digest(kind, self.priors.builds)
+        return "" if kind == "none" else digest(kind, self.priors_of(kind).builds)
 
     def voxel_channels(self, kind: PriorKind) -> int | None:
         """Channels of a prior's voxel; None for what has no voxels."""
         if kind in WITHOUT_VOXELS:
             return None
-        return GEOMETRY_CHANNELS + (self.priors.channel_count if kind == "presight" else 0)
+        return GEOMETRY_CHANNELS + (0 if kind in WITHOUT_FEATURES else self.priors_of(kind).channel_count)
 
     def online(self, keyframes: Sequence[Keyframe]) -> tuple[Tensor, CameraRig]:
         """Images (B, N, 3, H, W), 0 to 1, of some keyframes, and their rigs."""
@@ -144,13 +148,14 @@ class Material:
         )
 
     def _source(self, run: Run) -> PriorSource:
-        return self.lidar_history if run.prior == "lidar" else self.priors
+        return self.lidar_history if run.prior == "lidar" else self.priors_of(run.prior)
 
     def _place(self, run: Run, keyframe: Keyframe, own: bool = True, drives: str = "all") -> Place:
         """Where a keyframe is, with its own drive in the prior or without, and with so many of the others."""
-        if keyframe.city not in self.priors.generations or drives == "none":
+        priors = self.priors_of(run.prior)
+        if keyframe.city not in priors.generations or drives == "none":
             return Place(None, keyframe.world_from_ego)
-        names = self.priors.drive_names[keyframe.city]
+        names = priors.drive_names[keyframe.city]
         shown = self._names(keyframe.city, drives)
         hidden = [drive for drive, name in names.items() if name not in shown or (name == keyframe.scene and not own)]
         if run.prior == "lidar":  # which knows its drives by their names
@@ -161,6 +166,21 @@ class Material:
         """Scene names of all, every second or none of the drives in a city's prior."""
         names = sorted(set(self.priors.drive_names[city].values()))
         return {"all": names, "half": names[::2], "none": []}[drives]
+
+    def _open(self, store: str) -> CityPriors:
+        generations = {}
+        for city in sorted({keyframe.city for keyframe in self.keyframes}):
+            try:
+                generations[city] = PriorReader.open(store, city).generation.number
+            except NotFoundError:
+                continue
+        missing = {keyframe.city for keyframe in self.test} - generations.keys()
+        if missing:
+            raise InputError(
+                f"{store} has no prior of {', '.join(sorted(missing))}; "
+                f"build it: presight ingest {self.locations.data} --no-tests --no-nights, then presight build CITY"
+            )
+        return CityPriors(store, generations)
 
     def _of_role(self, role: Role) -> list[Keyframe]:
         chosen = [keyframe for keyframe in self.keyframes if keyframe.role == role]

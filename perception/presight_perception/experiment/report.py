@@ -45,19 +45,21 @@ def table_of(outcomes: Sequence[Outcome]) -> tuple[list[str], list[list[str]]]:
     is_map = "static" not in outcomes[0].figures["all"]
     names = MAP_FIGURES if is_map else OCCUPANCY_FIGURES
     groups = ["all", *(group for group in GROUPS if group in outcomes[0].figures)]
-    cells = [("all", name) for name in names] + [(group, "mean") for group in groups[1:]]
+    cells = [("all", name) for name in names] + [(group, "mean") for group in groups[1:]] + [("all", "fps")]
     by_label: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
         by_label.setdefault(outcome.row.label, []).append(outcome)
     lines = []
     for label, seeds in by_label.items():
-        values = [[each.figures[group][name] for each in seeds] for group, name in cells]
+        values = [[each.figures[group].get(name, np.nan) for each in seeds] for group, name in cells]
         lines.append([label, *(_mean_and_spread(value) for value in values), str(len(seeds))])
-    titles = [name if group == "all" else f"{name}, {group}" for group, name in cells]
-    return ["", *titles, "seeds"], lines
+    titles = [name if group == "all" else f"{name}, {group}" for group, name in cells[:-1]]
+    return ["", *titles, "frames/s", "seeds"], lines
 
 
 def _mean_and_spread(values: list[float]) -> str:
+    if np.isnan(values).any():
+        return ""  # what a row has no figure of
     mean = f"{np.mean(values):.1f}"
     return mean if len(values) < LEAST_SPREAD else f"{mean} ± {np.std(values, ddof=1):.1f}"
 

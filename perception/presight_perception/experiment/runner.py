@@ -26,7 +26,7 @@ from presight_perception.experiment.trial import Trial, constant_mask_figures
 
 CODE = 2  # raise it when the same run would give another model
 SILENT_S = 300.0  # who has said nothing for so long was killed
-FIGURES = 2  # raise it when the same model would be given other figures
+FIGURES = 3  # raise it when the same model would be given other figures
 
 _material: dict[str, Material] = {}  # of this process, which reads the tables once
 

@@ -9,8 +9,9 @@ from presight_perception.dataset import PositionNoise
 from presight_perception.voxelise import VoxelDrop
 
 ModelName = Literal["raster", "stream", "maptr", "bevdet-occ", "fb-occ"]
-# geometry: ours without features; nmp: Neural Map Prior, of the raster model alone
-PriorKind = Literal["none", "presight", "geometry", "lidar", "nmp"]
+# geometry: ours without features; colours: ours with features that nothing was learned for, of a store of their own;
+# nmp: Neural Map Prior, of the raster model alone
+PriorKind = Literal["none", "presight", "geometry", "colours", "lidar", "nmp"]
 MAP_MODELS: tuple[ModelName, ...] = ("raster", "stream", "maptr")
 OCCUPANCY_MODELS: tuple[ModelName, ...] = ("bevdet-occ", "fb-occ")
 

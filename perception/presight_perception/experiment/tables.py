@@ -26,6 +26,7 @@ class Scope:
     seeds: int = 3
     schedule: Schedule = field(default_factory=Schedule)
     model: ModelName | None = None  # of the tables about one model; None: the paper's, or the first of its kind
+    colours: bool = False  # whether there are priors with features that nothing was learned for
 
     def rows(self, label: str, model: ModelName, prior: PriorKind, *probes: tuple[str, Probe]) -> list[Row]:
         """A run of every seed, under every probe."""
@@ -82,7 +83,10 @@ def priors(scope: Scope) -> list[Row]:
 def features(scope: Scope) -> list[Row]:
     """Table 4: what the prior's features are worth."""
     model = scope.model or "raster"
-    names: dict[PriorKind, str] = {"none": "no prior", "geometry": "without features", "presight": "with features"}
+    names: dict[PriorKind, str] = {"none": "no prior", "geometry": "without features"}
+    if scope.colours:
+        names["colours"] = "colour statistics"
+    names["presight"] = "with features"
     return [row for kind, name in names.items() for row in scope.rows(f"{model}, {name}", model, kind)]
 
 

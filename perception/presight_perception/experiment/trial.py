@@ -1,5 +1,6 @@
 """Try a trained model on the test scenes, as a probe says."""
 
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
@@ -37,15 +38,30 @@ class Trial:
             self._memory.drive(material.prior_drives(probe), material)
 
     def figures(self, report: Report = silent) -> dict[str, Figures]:
-        """Figures over all test keyframes, and over groups of them, see `Material.groups_of`."""
-        count = len(self._material.test)
+        """Figures over all test keyframes, and over groups of them, see `Material.groups_of`.
+
+        Among those of all is "fps", keyframes a second of processor time, images not yet decoded left out.
+        """
+        count, spent_s = len(self._material.test), 0.0
         scorers: dict[str, Scorer] = defaultdict(lambda: self._task.scorer(self._model))
         for first in range(0, count, BATCH):
             rows = range(first, min(first + BATCH, count))
-            for row, found in zip(rows, self.found(rows), strict=True):
+            self._decode_images(rows)
+            started_s = time.process_time()
+            decoded = self.found(rows)
+            spent_s += time.process_time() - started_s
+            for row, found in zip(rows, decoded, strict=True):
                 _add(scorers, found, self._material.test[row], self._material)
             report(Progress(f"{self._run.title}, tried", rows[-1] + 1, count))
-        return {name: scorer.result() for name, scorer in scorers.items()}
+        figures = {name: scorer.result() for name, scorer in scorers.items()}
+        figures["all"]["fps"] = count / spent_s
+        return figures
+
+    def _decode_images(self, rows: Sequence[int]) -> None:
+        for row in rows:
+            keyframe = self._material.test[row]
+            for each in (keyframe, self._material.earlier(keyframe)):
+                self._material.image(each.token)  # which keeps it
 
     def found(self, rows: Sequence[int]) -> Sequence[Any]:
         """What the model finds in some test keyframes, decoded."""
