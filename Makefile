@@ -3,6 +3,8 @@
 PYTHON ?= python3.11
 TORCH ?= torch==2.13.0
 BIN = .venv/bin
+# A process for each core; a file's tests stay together, for what they share.
+PYTEST = $(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 .PHONY: install demo test torture check lint clean
 
@@ -19,15 +21,15 @@ demo: install
 
 # The faults fork a process that must not have touched a store: they have one of their own.
 test: install
-	$(BIN)/python -m pytest --ignore tests/torture
-	$(BIN)/python -m pytest tests/torture
+	$(PYTEST) --ignore tests/torture
+	$(PYTEST) tests/torture
 
 # Faults by the thousand: hours. What `make test` injects is the short form of it.
 torture: install
 	PRESIGHT_TORTURE=1 $(BIN)/python -m pytest --timeout 0 tests/torture tests/storage/test_store_model.py
 
 check: lint
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
 lint: install
 	$(BIN)/ruff check .
