@@ -42,10 +42,16 @@ WORST_ERROR = 0.3  # red in the picture
 
 
 @dataclass(frozen=True)
-class Tile(BenchTile):
-    """A tile of an embedded city, and what is true of it."""
+class SeenTile(BenchTile):
+    """A tile of an embedded city, and what its images show in truth."""
 
     truth: SceneTruth
+
+
+@dataclass(frozen=True)
+class Tile(SeenTile):
+    """The same, and the whole surface, seen or not."""
+
     surface: SurfaceTruth
 
 
@@ -137,7 +143,7 @@ def held_out_figures(tile: Tile, field: TileField) -> dict[str, Any]:
     }
 
 
-def pixels_of(tile: Tile, row: int, stride: int) -> tuple[NDArray, NDArray]:
+def pixels_of(tile: BenchTile, row: int, stride: int) -> tuple[NDArray, NDArray]:
     """Colours (N, 3) and features (N, C), 0..1, of every `stride`-th pixel of a row's image."""
     image, camera = tile.source.load(row), tile.job.frames.camera_of(row)
     pixels = pixel_centres(camera.width_px, camera.height_px, stride)
@@ -225,21 +231,31 @@ def centroids(batch: VoxelBatch) -> NDArray[np.float64]:
     return lattice.voxel_min(voxels) + (batch.centroid + 0.5) / CENTROID_STEPS * lattice.voxel_m
 
 
+@dataclass(frozen=True)
+class TrueHits:
+    """Where pixels of one image meet a static surface that extraction would keep."""
+
+    pixels: NDArray[np.int64]  # (N,) among every so many-th of the image
+    points_world: NDArray[np.float64]  # (N, 3)
+    labels: NDArray[np.uint8]  # (N,)
+
+
+def true_hits(tile: SeenTile, row: int, stride: int, heights: CameraHeights) -> TrueHits:
+    """Of every `stride`-th pixel of a row's image."""
+    settings, true = tile.job.settings.extraction, tile.truth.rays(row, stride)
+    kept = np.flatnonzero(static_classes()[true.labels] & (true.distance_m < settings.max_depth_m))
+    met = tile.job.frames.positions[row] + true.distance_m[kept, None] * true.directions[kept]
+    above_m = met[:, 2] - heights.at(met)
+    inside = (above_m >= -settings.below_camera_m) & (above_m <= settings.above_camera_m)
+    inside &= tile.extraction.owned(Lattice().block_of(Lattice().voxel_of(met)))
+    return TrueHits(kept[inside], met[inside], true.labels[kept[inside]])
+
+
 def true_points(tile: Tile, rows: list[int], stride: int) -> tuple[NDArray, NDArray]:
     """Static surface points (N, 3) that rays of these rows meet where extraction would keep them, and labels."""
-    settings, frames = tile.job.settings.extraction, tile.job.frames
-    heights = CameraHeights(frames.positions)
-    points, labels = [], []
-    for row in rows:
-        true = tile.truth.rays(row, stride)
-        kept = static_classes()[true.labels] & (true.distance_m < settings.max_depth_m)
-        met = frames.positions[row] + true.distance_m[kept, None] * true.directions[kept]
-        above_m = met[:, 2] - heights.at(met)
-        inside = (above_m >= -settings.below_camera_m) & (above_m <= settings.above_camera_m)
-        inside &= tile.extraction.owned(Lattice().block_of(Lattice().voxel_of(met)))
-        points.append(met[inside])
-        labels.append(true.labels[kept][inside])
-    return np.concatenate(points), np.concatenate(labels)
+    heights = CameraHeights(tile.job.frames.positions)
+    hits = [true_hits(tile, row, stride, heights) for row in rows]
+    return np.concatenate([each.points_world for each in hits]), np.concatenate([each.labels for each in hits])
 
 
 def seen_surface(tile: Tile) -> tuple[NDArray, NDArray]:

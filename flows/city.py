@@ -36,47 +36,21 @@ class Order:
     warm: bool = False  # go on from the fields that tiles have, where their recipes allow it
 
 
-@flow(name="rebuild_city", flow_run_name="rebuild {city}", persist_result=False)
-def rebuild_city(  # noqa: PLR0913, PLR0917 - what a deployment shows
-    workspace: str,
-    city: str,
-    overrides: list[str] | None = None,
-    threads: int = 1,
-    devices: list[str] | None = None,
-    wait: bool = False,
-    accept: list[str] | None = None,
-) -> dict[str, Any]:
-    """Build what is stale from nothing, and publish it.
-
-    A tile that fails keeps its old build and is named in the result. While another run builds the city this one
-    waits, or raises LeaseHeldError.
-    """
-    return _bring_up_to_date(Order(workspace, city, overrides or (), threads, devices or ["cpu"], wait, accept or ()))
-
-
-@flow(name="update_city", flow_run_name="update {city}", persist_result=False)
-def update_city(  # noqa: PLR0913, PLR0917 - likewise
-    workspace: str,
-    city: str,
-    overrides: list[str] | None = None,
-    threads: int = 1,
-    devices: list[str] | None = None,
-    wait: bool = False,
-    accept: list[str] | None = None,
-) -> dict[str, Any]:
-    """As `rebuild_city`, but tiles that only got new drives go on from the field that they have."""
-    order = Order(workspace, city, overrides or (), threads, devices or ["cpu"], wait, accept or ())
-    return _bring_up_to_date(replace(order, warm=True))
-
-
 def run_city(order: Order, crew: Crew) -> dict[str, Any]:
-    """Run the flow with this crew."""
-    run = (update_city if order.warm else rebuild_city).with_options(task_runner=crew.task_runner)
-    devices, accept = list(crew.devices), list(order.accept)
-    return run(order.workspace, order.city, list(order.overrides), crew.threads, devices, order.wait, accept=accept)
+    """Run the flow with this crew: what it published, and the tiles that failed, with why.
+
+    A tile that fails keeps its old build. While another run builds the city this one waits, or raises LeaseHeldError.
+    """
+    verb = "update" if order.warm else "rebuild"
+    run = bring_city_up_to_date.with_options(
+        name=f"{verb}_city", flow_run_name=f"{verb} {order.city}", task_runner=crew.task_runner
+    )
+    return run(replace(order, threads=crew.threads, devices=crew.devices))
 
 
-def _bring_up_to_date(order: Order) -> dict[str, Any]:
+@flow(persist_result=False)
+def bring_city_up_to_date(order: Order) -> dict[str, Any]:
+    """Build what is stale, and publish it."""
     opened = Workspace.open(Path(order.workspace))
     settings = load_city_settings(opened.city_file(order.city), order.overrides)
     with hold_city(opened, order.city, order.wait) as lease:

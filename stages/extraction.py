@@ -94,7 +94,7 @@ def extract_tile(
         report(Progress("extraction", done, len(rows), {"points": counts["points"]}))
     columns.keep(job.owned)
     counts["voxels"], counts["few_hits"] = sums.finish(settings.min_hits)
-    return ExtractionResult(_batches(sums, columns), job.drives, dict(counts))
+    return ExtractionResult(voxel_batches(sums, columns), job.drives, dict(counts))
 
 
 def chosen_rows(job: TileExtraction) -> list[int]:
@@ -178,7 +178,7 @@ def _seen_ends(
     return rays.origin + length_m[:, None] * rays.directions
 
 
-def _batches(sums: VoxelSums, columns: ObservedColumns) -> Iterator[VoxelBatch]:
+def voxel_batches(sums: VoxelSums, columns: ObservedColumns) -> Iterator[VoxelBatch]:
     """One batch for every superblock that has voxels or observed columns, in Morton order."""
     superblocks = {(x // SUPERBLOCK, y // SUPERBLOCK) for x, y in columns.blocks} | sums.superblocks
     ordered = np.array(list(superblocks), np.int64).reshape(-1, 2)
