@@ -5,7 +5,7 @@ Planning reads and never writes, but for `record_plan`; it imports neither torch
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -133,45 +133,20 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
     members_of = _members(frames, city_tiling, settings) if frames else []
     space_id = settings.features.space or workspace.artifacts().pinned_space(space_key(settings))
     features = features_recipe(settings, space_id) if space_id else None
+    planner = _TilePlanner(workspace, settings, known, city_tiling, features, generation)
     past = {build.tile_id: build for build in catalog.builds(city, "published")}
-    compare = partial(stale_reasons, known=known, index=workspace.drives())
-    lattice = Lattice()
     tiles, skipped = [], []
     for index, (tile, members) in enumerate(zip(city_tiling.tiles, members_of, strict=False)):
         if len(members) < MIN_FRAMES:
             skipped.append(f"{tile.tile_id}: {len(members)} frames, at least {MIN_FRAMES} are needed")
-            continue
-        training, recipe = (
-            (None, None) if features is None else _recipes(city_tiling, index, members, settings, features)
-        )
-        shown = generation.tiles.get(tile.tile_id) if generation else None
-        published = shown.recipe if shown else None
-        causes = compare(published, recipe.to_json() if recipe else None)
-        start = None
-        if causes and training:
-            stale = StaleTile(city, tile.tile_id, training, causes, members.positions)
-            start = find_start(workspace, stale, published, settings)
-        tiles.append(
-            TilePlan(
-                tile=index,
-                tile_id=tile.tile_id,
-                drive_ids=members.drive_ids,
-                frame_count=len(members),
-                training=training,
-                recipe=recipe,
-                causes=causes,
-                past=past.get(tile.tile_id),
-                voxel_count=shown.entry.voxel_count if shown else 0,
-                bytes=shown.entry.bytes if shown else 0,
-                start=start,
-            )
-        )
+        else:
+            tiles.append(planner.plan(index, members, past.get(tile.tile_id)))
     return CityPlan(
         city=city,
         settings=settings,
         known=known,
         tiling=city_tiling,
-        lattice=lattice,
+        lattice=Lattice(),
         space_id=space_id,
         features=features,
         tiles=tuple(tiles),
@@ -179,6 +154,70 @@ def plan_city(workspace: Workspace, city: str, settings: CitySettings) -> CityPl
         withdrawn=_withdrawn(generation, known, {tile.tile_id for tile in tiles}),
         generation=generation.number if generation else None,
     )
+
+
+@dataclass(frozen=True)
+class _TilePlanner:
+    """Plans one tile after the other, against the generation that is shown."""
+
+    workspace: Workspace
+    settings: CitySettings
+    known: CityDrives
+    tiling: Tiling
+    features: Recipe | None
+    generation: Generation | None
+
+    @cached_property
+    def index(self) -> DriveIndex:
+        """One for all tiles: it keeps what it has read."""
+        return self.workspace.drives()
+
+    def plan(self, index: int, members: Members, past: Build | None) -> TilePlan:
+        """The plan of one tile, by its index in the tiling."""
+        tile_id = self.tiling.tiles[index].tile_id
+        training, recipe = self._recipes(index, members)
+        shown = self.generation.tiles.get(tile_id) if self.generation else None
+        published = shown.recipe if shown else None
+        causes = stale_reasons(published, recipe.to_json() if recipe else None, known=self.known, index=self.index)
+        start = None
+        if causes and training:
+            stale = StaleTile(self.tiling.city, tile_id, training, causes, members.positions)
+            start = find_start(self.workspace, stale, published, self.settings)
+        return TilePlan(
+            tile=index,
+            tile_id=tile_id,
+            drive_ids=members.drive_ids,
+            frame_count=len(members),
+            training=training,
+            recipe=recipe,
+            causes=causes,
+            past=past,
+            voxel_count=shown.entry.voxel_count if shown else 0,
+            bytes=shown.entry.bytes if shown else 0,
+            start=start,
+        )
+
+    def _recipes(self, index: int, members: Members) -> tuple[Recipe | None, Recipe | None]:
+        """The recipes of a tile's training and of the whole tile; None until the feature space exists."""
+        if self.features is None:
+            return None, None
+        settings, tile = self.settings, self.tiling.tiles[index]
+        values = settings.model_dump(mode="json")
+        chosen = {name: values[name] for name in ("field", "sampling", "training", "tiling")}
+        chosen["training"] = {name: value for name, value in chosen["training"].items() if name != "checkpoint_every"}
+        of_city = ("tile_count", "seed")
+        chosen["tiling"] = {name: value for name, value in chosen["tiling"].items() if name not in of_city}
+        inputs = {
+            "drives": list(members.drive_ids),
+            "features": self.features.to_json(),
+            "dynamic_classes": list(settings.features.dynamic_classes),
+            "moving": masking.recipe(settings.features),
+            "tile": tile.tile_id,
+            "centroid_m": list(tile.centroid_m),
+        }
+        training = Recipe("training", versions.TRAINING, chosen, inputs)
+        extraction = {"extraction": values["extraction"]}
+        return training, Recipe("tile", versions.EXTRACTION, extraction, {"training": training.to_json()})
 
 
 def _no_drives(workspace: Workspace, city: str, known: CityDrives) -> InputError | NotFoundError:
@@ -290,24 +329,3 @@ def _cut_from(workspace: Workspace, city: str) -> NDArray[np.float64]:
             with suppress(NotFoundError):  # a removed drive whose index was cleared
                 positions.append(index.positions(record.drive.drive_id)[0])
     return np.concatenate(positions)
-
-
-def _recipes(
-    city_tiling: Tiling, tile: int, members: Members, settings: CitySettings, features: Recipe
-) -> tuple[Recipe, Recipe]:
-    """The recipes of a tile's training and of the whole tile."""
-    values = settings.model_dump(mode="json")
-    chosen = {name: values[name] for name in ("field", "sampling", "training", "tiling")}
-    chosen["training"] = {name: value for name, value in chosen["training"].items() if name != "checkpoint_every"}
-    chosen["tiling"] = {name: value for name, value in chosen["tiling"].items() if name not in ("tile_count", "seed")}
-    inputs = {
-        "drives": list(members.drive_ids),
-        "features": features.to_json(),
-        "dynamic_classes": list(settings.features.dynamic_classes),
-        "moving": masking.recipe(settings.features),
-        "tile": city_tiling.tiles[tile].tile_id,
-        "centroid_m": list(city_tiling.tiles[tile].centroid_m),
-    }
-    training = Recipe("training", versions.TRAINING, chosen, inputs)
-    whole = Recipe("tile", versions.EXTRACTION, {"extraction": values["extraction"]}, {"training": training.to_json()})
-    return training, whole
