@@ -65,6 +65,7 @@ class Rays:
 
     origin: NDArray[np.float64]  # (3,) world
     directions: NDArray[np.float64]  # (N, 3) world, unit
+    features: NDArray[np.uint8]  # (N, C) of the image where each ray leaves it, 255 = 1.0
 
 
 def extract_tile(
@@ -117,12 +118,13 @@ def _rays(job: TileExtraction, row: int, source: PixelSource, counts: Counter[st
     """Rays of one frame through every n-th pixel, but for dynamic things and the sky."""
     camera = job.frames.camera_of(row)
     pixels = pixel_centres(camera.width_px, camera.height_px, job.settings.extraction.pixel_stride)
-    grid = source.load(row).labels
-    labels = grid[cell_of(pixels, (camera.width_px, camera.height_px), grid.shape)]
+    image, size_px = source.load(row), (camera.width_px, camera.height_px)
+    labels = image.labels[cell_of(pixels, size_px, image.labels.shape)]
     dynamic = classes.lookup(job.settings.features.dynamic_classes)[labels]
     sky = (labels == classes.SKY) & ~dynamic
     counts.update(pixels=len(pixels), dynamic=int(dynamic.sum()), sky=int(sky.sum()))
-    return Rays(*camera.rays(pixels[~dynamic & ~sky]))
+    followed = pixels[~dynamic & ~sky]
+    return Rays(*camera.rays(followed), image.features[cell_of(followed, size_px, image.features.shape)])
 
 
 def _meet_surfaces(
@@ -138,7 +140,9 @@ def _meet_surfaces(
     found = surface.found & np.isfinite(values).all(-1)
     counts["no_surface"] += int((~found).sum())
     columns = {column.name: getattr(surface, column.name)[found] for column in fields(SurfacePoints)}
-    return Rays(rays.origin, rays.directions[found]), SurfacePoints(**columns)
+    if job.settings.extraction.features == "images":
+        columns["features"] = rays.features[found] / np.float32(255)
+    return Rays(rays.origin, rays.directions[found], rays.features[found]), SurfacePoints(**columns)
 
 
 def _filtered(

@@ -29,6 +29,7 @@ WIDTH, HEIGHT = 60, 40
 GROUND_M, WALL_M, ROOF_M = 0.1, 6.1, 5.0  # ground height; the wall's y, and its top
 EYE_M = 1.6
 CHANNELS = 4
+LEFT, RIGHT = 51, 204  # features of the images' halves
 THIN_M = 12.0  # beyond this x the field is foggy: density below the filter
 CITY = CitySettings.model_validate(
     {
@@ -65,13 +66,18 @@ def street_frames(count: int = 6, drives: tuple[str, ...] = ("drive-b", "drive-a
 
 
 class StreetPixels:
-    """Labels of every frame: sky in the top quarter, a car in the lower left corner, else road."""
+    """Labels of every frame: sky in the top quarter, a car in the lower left corner, else road.
+
+    Features are one value left of the middle, and another one right of it.
+    """
+
+    features = np.stack([np.full((1, CHANNELS), value, np.uint8) for value in (LEFT, RIGHT)], 1)
 
     def load(self, row: int) -> FramePixels:
         labels = np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
         labels[:5] = classes.SKY
         labels[-4:, :10] = classes.CITYSCAPES.index("car")
-        return FramePixels(np.zeros((HEIGHT, WIDTH, 3), np.uint8), labels, np.zeros((1, 1, CHANNELS), np.uint8))
+        return FramePixels(np.zeros((HEIGHT, WIDTH, 3), np.uint8), labels, self.features)
 
 
 def frame_of(upper: int, lower: int) -> FramePixels:
@@ -201,6 +207,16 @@ def test_voxels_carry_the_fields_values_and_every_drive(tmp_path: Path):
     assert set(np.concatenate([batch.density for batch in batches]).tolist()) == {3.0}
     assert result.drives == ("drive-a", "drive-b")
     assert set(np.concatenate([batch.drives for batch in batches]).ravel().tolist()) == {0b11}
+
+
+def test_voxels_can_have_the_features_of_the_images_that_saw_them(tmp_path: Path):
+    """The cameras drive along y = 0, between two voxels."""
+    city = CITY.model_copy(update={"extraction": CITY.extraction.model_copy(update={"features": "images"})})
+    _, batches = extracted(job_of(street_frames(), city=city), tmp_path)
+    features = np.concatenate([batch.features for batch in batches])
+    is_left = voxels_of(batches)[:, 1] >= 0
+    assert 0 < is_left.sum() < len(features)
+    assert (features == np.where(is_left, LEFT, RIGHT)[:, None]).all()
 
 
 def test_batches_are_sorted_and_valid(tmp_path: Path):
