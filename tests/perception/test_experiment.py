@@ -282,7 +282,11 @@ def test_a_job_ends_when_nobody_waits_for_it(
         def is_alive(self) -> bool:
             return False
 
+    def end(code: int) -> None:
+        raise SystemExit(code)
+
     monkeypatch.setattr("multiprocessing.parent_process", Dead)
+    monkeypatch.setattr("os._exit", end)
     with pytest.raises(SystemExit):
         do_job(Job(WITH_PRIOR, (Probe(),), locations, tmp_path))
 

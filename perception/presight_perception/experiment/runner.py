@@ -6,7 +6,7 @@ and a broken-off experiment goes on where it was.
 
 import json
 import multiprocessing
-import sys
+import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -113,10 +113,9 @@ class _Follow:
 
     def tell(self, progress: Progress) -> None:
         parent = multiprocessing.parent_process()
-        if (
-            parent is not None and not parent.is_alive()
-        ):  # killed: nobody waits, and a new experiment may be at this run
-            sys.exit(1)
+        if parent is not None and not parent.is_alive():
+            # Killed: nobody waits, and a new experiment may be at this run. The pool would catch an exception.
+            os._exit(1)
         self._file.parent.mkdir(parents=True, exist_ok=True)
         _write_json(self._file, asdict(progress))
 
