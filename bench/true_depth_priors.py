@@ -15,14 +15,14 @@ import numpy as np
 from bench.field_quality import SeenTile, pixels_of, true_hits
 from bench.field_tile import open_tile
 from bench.field_truth import SceneTruth
-from presight_core.priors.documents import GenerationTile
+from bench.prior_store import MadeTile, publish_city
+from flows.plan import CityPlan
 from presight_core.priors.schema import VoxelBatch
 from stages.camera_heights import CameraHeights
 from stages.extraction import chosen_rows, voxel_batches
 from stages.observed_columns import ObservedColumns
 from stages.voxel_sums import Samples, VoxelSums
 from storage.priors import PriorStore
-from storage.tile_groups import TileName
 
 DENSITY = 100.0  # per metre: a surface
 
@@ -35,28 +35,21 @@ def main() -> None:
     parser.add_argument("city", nargs="+")
     options = parser.parse_args()
     for city in options.city:
-        publish(options.workspace, PriorStore.open(options.store), city)
+        first = open_tile(options.workspace, city, 0, [])
+        tiles = true_tiles(options.workspace, first.plan)
+        publish_city(
+            PriorStore.open(options.store), first.plan, first.job.feature_channels, tiles, {"true_depth": True}
+        )
 
 
-def publish(workspace: Path, store: PriorStore, city: str) -> None:
-    """All tiles of a city as its first generation."""
-    plan = open_tile(workspace, city, 0, []).plan
-    names = {drive.drive_id: drive.name for drive in plan.drives}
-    tiles: dict[str, GenerationTile | None] = {}
+def true_tiles(workspace: Path, plan: CityPlan) -> Iterator[MadeTile]:
+    """The tiles of a city."""
     for index, planned in enumerate(plan.tiling.tiles):
-        opened = open_tile(workspace, city, index, [])
+        opened = open_tile(workspace, plan.city, index, [])
         truth = SceneTruth(plan.drives, opened.job.frames)
         tile = SeenTile(opened.plan, opened.job, opened.extraction, opened.source, truth)
-        if not tiles:
-            store.create_city(city, plan.lattice, str(plan.space_id), tile.job.feature_channels)
         with tempfile.TemporaryDirectory() as scratch:
-            drives, batches = tile.extraction.drives, true_batches(tile, Path(scratch))
-            name = TileName(planned.tile_id, "true-depth")
-            entry = store.write_tile(city, name, batches, drives, {"recipe": {}})
-        print(f"{city} {planned.tile_id}: {entry.voxel_count} voxels", flush=True)
-        chosen_names = {drive: names[drive] for drive in drives}
-        tiles[planned.tile_id] = GenerationTile(entry, {"true_depth": True}, {"drive_names": chosen_names})
-    store.publish(city, tiles, None, plan.tiling.to_json())
+            yield MadeTile(planned.tile_id, tile.extraction.drives, true_batches(tile, Path(scratch)))
 
 
 def true_batches(tile: SeenTile, scratch: Path) -> Iterator[VoxelBatch]:

@@ -133,14 +133,14 @@ def _meet_surfaces(
     """The rays that meet a surface whose values are numbers, and those surfaces."""
     origins = np.broadcast_to(rays.origin, rays.directions.shape)
     surface = find_surface(field, origins, rays.directions, job.settings.extraction.surface)
-    channels = surface.features.shape[-1]
-    if channels != job.feature_channels:
+    channels, of_images = surface.features.shape[-1], job.settings.extraction.features == "images"
+    if channels != job.feature_channels and not of_images:
         raise InputError(f"the field has {channels} channels, the feature space {job.feature_channels}; train it anew")
     values = np.concatenate([surface.points_world, surface.features, surface.rgb, surface.density[:, None]], -1)
     found = surface.found & np.isfinite(values).all(-1)
     counts["no_surface"] += int((~found).sum())
     columns = {column.name: getattr(surface, column.name)[found] for column in fields(SurfacePoints)}
-    if job.settings.extraction.features == "images":
+    if of_images:
         columns["features"] = rays.features[found] / np.float32(255)
     return Rays(rays.origin, rays.directions[found], rays.features[found]), SurfacePoints(**columns)
 

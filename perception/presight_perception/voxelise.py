@@ -131,13 +131,17 @@ class VoxelDrop:
 
     greatest_share: float = 1.0  # of single voxels: each sample loses a random share up to this (paper: 1)
     whole_chance: float = 0.0  # of losing the whole prior; 0.3 to 0.5 keeps a model from ignoring its cameras
+    side_chance: float = 0.0  # of losing a random share of the voxels, all on one side of a line, as new ground does
 
     def apply(self, voxels: Voxels, random: np.random.Generator) -> Voxels:
         """The voxels that remain, in order. Draws the same numbers from `random` whatever the voxels."""
-        whole, share = random.random(2)
+        whole, share, side, side_share, angle = random.random(5)
         kept = random.random(len(voxels.features)) >= share * self.greatest_share
         if whole < self.whole_chance:
             kept[:] = False
+        elif side < self.side_chance and len(kept):
+            across = voxels.coordinates[:, :2] @ np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
+            kept &= across >= np.quantile(across, side_share)
         return Voxels(voxels.features[kept], voxels.coordinates[kept])
 
 

@@ -17,11 +17,12 @@ from presight_perception.dataset import PositionNoise, PriorDataset
 from presight_perception.experiment.keyframes import ImageSize, lidar_depth, read_images, read_keyframes, rig_of
 from presight_perception.experiment.material import Locations, Material
 from presight_perception.experiment.report import table_of, write_report
-from presight_perception.experiment.runner import Job, Outcome, do_job, do_rows, run_folder, running
-from presight_perception.experiment.runs import Probe, Run, Schedule
+from presight_perception.experiment.runner import Job, Outcome, do_job, do_rows, running
+from presight_perception.experiment.runs import LINE_MODELS, Probe, Run, Schedule
 from presight_perception.experiment.tables import TABLES, Row, Scope, rows_of
 from presight_perception.experiment.tasks import MapTask, task_of
-from presight_perception.experiment.training import batch_rows, epoch_of, trained_model
+from presight_perception.experiment.trained_models import build_model, run_folder, trained_model
+from presight_perception.experiment.training import batch_rows, epoch_of
 from presight_perception.experiment.trial import Trial, constant_mask_figures
 from tests.perception import toy_dataset
 from tests.perception.conftest import publish
@@ -200,6 +201,28 @@ def test_a_model_with_a_map_of_its_own_remembers_the_prior_drives(material: Mate
     for probe in (Probe(), Probe(drives="none")):
         Trial(model, run, probe, task, material).found([0])
     assert not torch.allclose(*found)
+
+
+def test_a_line_model_learns_on_the_view_of_a_raster_mapper_which_it_keeps(material: Material, tmp_path: Path) -> None:
+    run = Run("stream", "presight", schedule=SCHEDULE, masks=SCHEDULE)
+    stages: list[str] = []
+    task = task_of("stream", material.locations)
+    model = trained_model(run, task, material, tmp_path, lambda each: stages.append(each.stage))
+    assert run.teacher == WITH_PRIOR
+    assert list(dict.fromkeys(stages)) == [WITH_PRIOR.title, f"{run.title}, bird's-eye views", run.title]
+    teacher = trained_model(WITH_PRIOR, task, material, tmp_path, lambda _: None).state_dict()
+    untrained = build_model(run, material).state_dict()
+    for name, weight in model.state_dict().items():
+        if name.startswith("bev."):
+            torch.testing.assert_close(weight, teacher[name])
+    assert not torch.equal(model.state_dict()["classify.weight"], untrained["classify.weight"])
+
+
+def test_runs_of_one_teacher_wait_for_it(material: Material, tmp_path: Path) -> None:
+    rows = [Row(name, Run(name, schedule=SCHEDULE, masks=SCHEDULE)) for name in LINE_MODELS]
+    outcomes = do_rows(rows, material.locations, tmp_path, 2)
+    assert [set(outcome.figures) for outcome in outcomes] == [{"all", "night", "mapped ground"}] * 2
+    assert sorted(folder.name.split("-")[0] for folder in tmp_path.iterdir()) == ["maptr", "raster", "stream"]
 
 
 def test_an_epoch_begins_where_all_samples_were_seen() -> None:

@@ -24,11 +24,11 @@ from presight_perception.experiment.pictures import (
     write_strip,
 )
 from presight_perception.experiment.report import table_of, write_report
-from presight_perception.experiment.runner import Outcome, do_rows, run_folder, running
+from presight_perception.experiment.runner import Outcome, do_rows, running
 from presight_perception.experiment.runs import ModelName, Probe, Run, Schedule
 from presight_perception.experiment.tables import Row, Scope, rows_of
 from presight_perception.experiment.tasks import task_of
-from presight_perception.experiment.training import trained_model
+from presight_perception.experiment.trained_models import trained_model
 from presight_perception.experiment.trial import Trial
 
 STRIPS = 6  # pictures of a report
@@ -80,7 +80,7 @@ def write_pictures(rows: Sequence[Row], material: Material, runs: Path, folder: 
     if not shown:
         return []
     task = task_of(shown[0].model, material.locations)
-    models = [trained_model(run, task, material, run_folder(run, material, runs), silent) for run in shown]
+    models = [trained_model(run, task, material, runs, silent) for run in shown]
     trials = [Trial(model, run, Probe(), task, material) for model, run in zip(models, shown, strict=True)]
     files = []
     for row in spread(material.test, STRIPS):

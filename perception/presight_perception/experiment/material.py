@@ -121,7 +121,9 @@ class Material:
         """The prior's voxels around the training keyframes, each without its own drive; None if it has no voxels."""
         if run.prior in WITHOUT_VOXELS:
             return None
-        settings = PriorSettings(grid, run.prior != "geometry", drop=run.drop, cache_bytes=CACHE_BYTES, seed=run.seed)
+        settings = PriorSettings(
+            grid, run.prior != "geometry", drop=run.drop, noise=run.noise, cache_bytes=CACHE_BYTES, seed=run.seed
+        )
         return PriorDataset(self._source(run), [self._place(run, each, own=False) for each in self.train], settings)
 
     def is_mapped(self, keyframe: Keyframe) -> bool:

@@ -1,7 +1,6 @@
 """Do an experiment: train what is not trained yet, try what is not tried yet, several runs side by side.
 
-A folder keeps runs and their figures by the digest of everything that decides them, so that tables share their work,
-and a broken-off experiment goes on where it was.
+Runs and their figures are kept, so that tables share their work, and a broken-off experiment goes on where it was.
 """
 
 import json
@@ -21,10 +20,10 @@ from presight_perception.experiment.material import Locations, Material
 from presight_perception.experiment.runs import Probe, Run, digest
 from presight_perception.experiment.tables import Row
 from presight_perception.experiment.tasks import Figures, MapTask, task_of
-from presight_perception.experiment.training import trained_model, write_whole
+from presight_perception.experiment.trained_models import run_folder, trained_model
+from presight_perception.experiment.training import write_whole
 from presight_perception.experiment.trial import Trial, constant_mask_figures
 
-CODE = 2  # raise it when the same run would give another model
 SILENT_S = 300.0  # who has said nothing for so long was killed
 FIGURES = 3  # raise it when the same model would be given other figures
 
@@ -56,15 +55,22 @@ def do_rows(
     probes: dict[Run | None, dict[Probe, None]] = {}
     for row in rows:
         probes.setdefault(row.run, {})[row.probe] = None
+    for teacher in [run.teacher for run in probes if run is not None and run.teacher is not None]:
+        probes.setdefault(teacher, {})
     jobs = [Job(run, tuple(tried), locations, folder) for run, tried in probes.items()]
+    taught = [job for job in jobs if job.run is not None and job.run.teacher is not None]
+    waves = [[job for job in jobs if job not in taught], taught]
     figures: dict[tuple[Run | None, Probe], dict[str, Figures]] = {}
     # Spawned: forked children of a process that has used torch's threads may hang.
     with ProcessPoolExecutor(parallel, multiprocessing.get_context("spawn")) as pool:
-        pending = {pool.submit(do_job, job): job for job in jobs}
-        for done, future in enumerate(as_completed(pending), 1):
-            job = pending[future]
-            figures |= {(job.run, probe): found for probe, found in zip(job.probes, future.result(), strict=True)}
-            report(Progress("runs", done, len(jobs)))
+        done = 0
+        for wave in waves:  # two runs of one teacher must not both train it
+            pending = {pool.submit(do_job, job): job for job in wave}
+            for future in as_completed(pending):
+                job = pending[future]
+                figures |= {(job.run, probe): found for probe, found in zip(job.probes, future.result(), strict=True)}
+                done += 1
+                report(Progress("runs", done, len(jobs)))
     return [Outcome(row, figures[row.run, row.probe]) for row in rows]
 
 
@@ -79,7 +85,7 @@ def do_job(job: Job) -> list[dict[str, Figures]]:
     folder = run_folder(job.run, material, job.folder)
     task = task_of(job.run.model, job.locations)
     follow = _Follow(folder / "progress.json", job.run)
-    model = trained_model(job.run, task, material, folder, follow.tell)
+    model = trained_model(job.run, task, material, job.folder, follow.tell)
     found = []
     for probe in job.probes:
         file = folder / f"figures-{digest(FIGURES, probe, job.locations.test_stride)}.json"
@@ -89,12 +95,6 @@ def do_job(job: Job) -> list[dict[str, Figures]]:
         found.append(json.loads(file.read_text(encoding="utf-8"))["figures"])
     follow.end()
     return found
-
-
-def run_folder(run: Run, material: Material, folder: Path) -> Path:
-    """Where a run is kept: named by all that decides it."""
-    named = digest(CODE, run, material.digest, material.prior_digest(run.prior))
-    return folder / f"{run.model}-{run.prior}-{run.seed}-{named}"
 
 
 def material_of(locations: Locations) -> Material:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from presight_perception.dataset import PositionNoise
@@ -13,6 +13,7 @@ ModelName = Literal["raster", "stream", "maptr", "bevdet-occ", "fb-occ"]
 # nmp: Neural Map Prior, of the raster model alone
 PriorKind = Literal["none", "presight", "geometry", "colours", "lidar", "nmp"]
 MAP_MODELS: tuple[ModelName, ...] = ("raster", "stream", "maptr")
+LINE_MODELS: tuple[ModelName, ...] = ("stream", "maptr")
 OCCUPANCY_MODELS: tuple[ModelName, ...] = ("bevdet-occ", "fb-occ")
 
 
@@ -35,8 +36,16 @@ class Run:
     cameras: bool = True  # False: sees the prior alone (Table 7, setting b)
     seed: int = 0
     schedule: Schedule = field(default_factory=Schedule)
-    # Hiding the whole prior in a share of the samples keeps the model from ignoring its cameras.
-    drop: VoxelDrop = field(default_factory=lambda: VoxelDrop(whole_chance=0.4))
+    # A prior that is hidden, whole or on one side, and never quite in place keeps the model looking at its cameras.
+    drop: VoxelDrop = field(default_factory=lambda: VoxelDrop(whole_chance=0.4, side_chance=0.3))
+    noise: PositionNoise = field(default_factory=lambda: PositionNoise(0.4))
+    # Of a line model: how the raster mapper learned whose bird's-eye view it looks into. None: it learns its own.
+    masks: Schedule | None = None
+
+    @property
+    def teacher(self) -> "Run | None":
+        """The raster mapper with the same senses whose bird's-eye view this run takes over, if any."""
+        return None if self.masks is None else replace(self, model="raster", schedule=self.masks, masks=None)
 
     @property
     def title(self) -> str:

@@ -1,12 +1,22 @@
 """The paper's tables as lists of rows: which trained model is tried how."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from presight_core.errors import InputError
 from presight_perception.dataset import PositionNoise
-from presight_perception.experiment.runs import MAP_MODELS, OCCUPANCY_MODELS, ModelName, PriorKind, Probe, Run, Schedule
+from presight_perception.experiment.runs import (
+    LINE_MODELS,
+    MAP_MODELS,
+    OCCUPANCY_MODELS,
+    ModelName,
+    PriorKind,
+    Probe,
+    Run,
+    Schedule,
+)
 
+LINE_STEPS = 5  # of a decoder of lines for each step of the raster mapper that it learns from
 NOISE_M = (0.25, 0.5, 1.0)  # standard deviations of the vehicle's position (Table 6)
 
 
@@ -31,17 +41,31 @@ class Scope:
     def rows(self, label: str, model: ModelName, prior: PriorKind, *probes: tuple[str, Probe]) -> list[Row]:
         """A run of every seed, under every probe."""
         return [
-            Row(f"{label}{suffix}", Run(model, prior, seed=seed, schedule=self.schedule), probe)
+            Row(f"{label}{suffix}", self._run(model, prior, seed), probe)
             for suffix, probe in probes or [("", Probe())]
             for seed in range(self.seeds)
         ]
 
     def prior_only(self, label: str, model: ModelName) -> list[Row]:
         """A model without cameras, of every seed."""
-        return [
-            Row(label, Run(model, "presight", cameras=False, seed=seed, schedule=self.schedule))
-            for seed in range(self.seeds)
-        ]
+        runs = [self._run(model, "presight", seed) for seed in range(self.seeds)]
+        return [Row(label, replace(run, cameras=False)) for run in runs]
+
+    def _run(self, model: ModelName, prior: PriorKind, seed: int) -> Run:
+        if model in LINE_MODELS:
+            return Run(model, prior, seed=seed, schedule=self.lines_schedule, masks=self.schedule)
+        schedule = self.voxels_schedule if model in OCCUPANCY_MODELS else self.schedule
+        return Run(model, prior, seed=seed, schedule=schedule)
+
+    @property
+    def lines_schedule(self) -> Schedule:
+        """Of a decoder of lines that looks into a raster mapper's bird's-eye view."""
+        return Schedule(LINE_STEPS * self.schedule.steps, 8, 1.5e-3)
+
+    @property
+    def voxels_schedule(self) -> Schedule:
+        """Of an occupancy model, whose samples are large."""
+        return replace(self.schedule, batch_size=2)
 
 
 def headline(scope: Scope) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Train one model, going on where an interrupted training stopped."""
+"""The steps of a training, going on where an interrupted one stopped."""
 
 import json
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from presight_core.progress import Progress, Report
@@ -16,10 +16,8 @@ from presight_perception.dataset import collate
 from presight_perception.experiment.map_memory import MapMemory
 from presight_perception.experiment.material import Material
 from presight_perception.experiment.runs import Run, Schedule
-from presight_perception.experiment.tasks import MODELS, Task
-from presight_perception.models.bev_features import Sources
+from presight_perception.experiment.tasks import Task
 from presight_perception.models.nmp_raster_mapper import NmpRasterMapper
-from presight_perception.models.raster_mapper import RasterMapperSettings
 
 CHECKPOINT_STEPS = 100  # a minute or two of work at most is done again
 REPORT_STEPS = 10
@@ -27,33 +25,17 @@ GRADIENT_NORM = 35.0  # greatest; as in the released configurations
 WARM_UP = 0.15  # of the steps
 
 
-def build_model(run: Run, material: Material) -> nn.Module:
-    """The untrained model of a run, the same one for the same seed."""
-    torch.manual_seed(run.seed)
-    if run.prior == "nmp":
-        return NmpRasterMapper(RasterMapperSettings.tiny())
-    return MODELS[run.model](Sources(run.cameras, material.voxel_channels(run.prior)))
+class Training:
+    """The steps of one run. Progress is kept every now and then, and gone on from."""
 
-
-def trained_model(run: Run, task: Task, material: Material, folder: Path, report: Report) -> nn.Module:
-    """The model of a run, from `folder` if it was trained before, else trained and kept there."""
-    model, weights = build_model(run, material), folder / "weights.safetensors"
-    if not weights.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        _Training(run, task, material, model, folder / "checkpoint.safetensors").go(report)
-        write_whole(weights, lambda file: save_file(model.state_dict(), file))
-        (folder / "checkpoint.safetensors").unlink(missing_ok=True)
-    model.load_state_dict(load_file(weights))
-    return model.eval()
-
-
-class _Training:
     def __init__(self, run: Run, task: Task, material: Material, model: nn.Module, checkpoint: Path) -> None:
         self._run, self._task, self._material, self._model = run, task, material, model
         self._checkpoint = checkpoint
         schedule = run.schedule
         self._optimizer = torch.optim.AdamW(
-            model.parameters(), schedule.learning_rate, weight_decay=schedule.weight_decay
+            [each for each in model.parameters() if each.requires_grad],
+            schedule.learning_rate,
+            weight_decay=schedule.weight_decay,
         )
         self._rate = torch.optim.lr_scheduler.OneCycleLR(
             self._optimizer, schedule.learning_rate, total_steps=schedule.steps, pct_start=WARM_UP
@@ -64,7 +46,7 @@ class _Training:
     def go(self, report: Report) -> None:
         """All steps that are left."""
         losses: list[float] = []
-        self._model.train()
+        self._prepare(report)
         for step in range(self._resume(), self._run.schedule.steps):
             epoch = epoch_of(self._run.schedule, len(self._material.train), step)
             if self._prior is not None:
@@ -79,16 +61,21 @@ class _Training:
             if done % CHECKPOINT_STEPS == 0:
                 self._keep(done)
 
+    def _prepare(self, report: Report) -> None:
+        self._model.train()
+
     def _step(self, rows: list[int]) -> float:
-        truths = [self._task.truth(self._model, self._material.train[row]) for row in rows]
-        losses: dict[str, Tensor] = self._model.loss(self._predictions(rows), truths)  # pyright: ignore
-        loss = torch.stack(list(losses.values())).sum()
+        loss = torch.stack(list(self._losses(rows).values())).sum()
         self._optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self._model.parameters(), GRADIENT_NORM)
         self._optimizer.step()
         self._rate.step()
         return loss.item()
+
+    def _losses(self, rows: list[int]) -> dict[str, Tensor]:
+        truths = [self._task.truth(self._model, self._material.train[row]) for row in rows]
+        return self._model.loss(self._predictions(rows), truths)  # pyright: ignore[reportCallIssue]
 
     def _predictions(self, rows: list[int]) -> Any:
         keyframes = [self._material.train[row] for row in rows]
