@@ -18,7 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from presight_core.errors import InputError, MissingDependencyError, SettingsError
 from presight_core.priors import PriorReader
-from presight_perception.dataset import AugmentationRange, CityPriors, Place, PointCache, PriorPoints, PriorSettings
+from presight_perception.dataset import (
+    AugmentationRange,
+    CityPriors,
+    Place,
+    PointCache,
+    PositionNoise,
+    PriorPoints,
+    PriorSettings,
+)
 from presight_perception.voxelise import MAPPING_GRID, BevAugmentation, VoxelDrop, VoxelGrid
 
 Results = dict[str, Any]
@@ -55,6 +63,7 @@ class LoadPrior:
     voxel_size: Sequence[float] = MAPPING_GRID.voxel_m
     with_features: bool = True  # False: position and hits alone, 4 channels
     drop: Mapping[str, float] | None = None  # for training: the fields of `VoxelDrop`
+    noise: Mapping[str, Any] | None = None  # for training: the fields of `PositionNoise`
     result_keys: Mapping[str, Any] = field(default_factory=dict)  # fields of `ResultKeys` unlike its defaults
     cities_without_prior: Sequence[str] = ()  # whose samples get no voxels, where other cities are an error
     cache_bytes: int = PriorSettings.cache_bytes  # of windows, in each worker process
@@ -64,9 +73,11 @@ class LoadPrior:
         try:
             self._keys = ResultKeys(**self.result_keys)
             drop = None if self.drop is None else VoxelDrop(**self.drop)
+            noise = PositionNoise(**(self.noise or {}))
         except TypeError as error:
-            raise SettingsError(f"LoadPrior: {error}; see ResultKeys and VoxelDrop for the names") from error
-        self._settings = PriorSettings(self._grid(), self.with_features, drop=drop)
+            names = "ResultKeys, VoxelDrop and PositionNoise"
+            raise SettingsError(f"LoadPrior: {error}; see {names} for the names") from error
+        self._settings = PriorSettings(self._grid(), self.with_features, drop=drop, noise=noise)
         self._generations = {
             city: PriorReader.open(self.store, city).generation.number if number is None else number
             for city, number in self.cities.items()

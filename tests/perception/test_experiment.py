@@ -218,6 +218,7 @@ def test_a_line_model_learns_on_the_view_of_a_raster_mapper_which_it_keeps(mater
     assert not torch.equal(model.state_dict()["classify.weight"], untrained["classify.weight"])
 
 
+@pytest.mark.slow
 def test_runs_of_one_teacher_wait_for_it(material: Material, tmp_path: Path) -> None:
     rows = [Row(name, Run(name, schedule=SCHEDULE, masks=SCHEDULE)) for name in LINE_MODELS]
     outcomes = do_rows(rows, material.locations, tmp_path, 2)

@@ -184,6 +184,14 @@ def test_a_whole_prior_can_be_dropped(town):
     assert voxels.coordinates.shape == (0, 3)
 
 
+def test_a_prior_can_be_moved_by_another_error_of_position_each_time(town):
+    load, exact = step(town, noise={"deviation_m": 0.4}), found(step(town)(results_at()))
+    torch.manual_seed(3)
+    moved = [found(load(results_at())) for _ in range(2)]
+    for one, other in ((moved[0], exact), (moved[1], exact), (moved[0], moved[1])):
+        assert not np.array_equal(one.coordinates, other.coordinates)
+
+
 def test_without_features_a_voxel_has_four_channels(town):
     assert found(step(town, with_features=False)(results_at())).features.shape[1] == 4
 

@@ -108,7 +108,7 @@ def test_a_drop_can_lose_one_side_of_the_prior():
     x, y = (axis.reshape(-1) for axis in np.meshgrid(np.arange(20), np.arange(20), indexing="ij"))
     voxels = Voxels(np.zeros((400, 5), np.float32), np.stack([x, y, np.zeros_like(x)], -1).astype(np.int32))
     drop, shares = VoxelDrop(greatest_share=0.0, side_chance=0.5), []
-    for seed in range(400):
+    for seed in range(200):
         kept = drop.apply(voxels, np.random.default_rng(seed)).coordinates[:, :2]
         shares.append(len(kept) / 400)
         if 0.2 < shares[-1] < 0.8:
@@ -117,5 +117,5 @@ def test_a_drop_can_lose_one_side_of_the_prior():
             lost = np.argwhere(is_lost)
             assert (Delaunay(kept).find_simplex(lost) < 0).all()  # none within what was kept: a line parts them
     whole = np.array(shares) == 1
-    assert whole.mean() == pytest.approx(0.5, abs=0.08)
-    assert np.mean(np.array(shares)[~whole]) == pytest.approx(0.5, abs=0.08)
+    assert whole.mean() == pytest.approx(0.5, abs=0.1)
+    assert np.mean(np.array(shares)[~whole]) == pytest.approx(0.5, abs=0.1)
