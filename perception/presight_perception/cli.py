@@ -43,7 +43,7 @@ def experiment(  # noqa: PLR0913, PLR0917 - a command's options
     ),
     model: Annotated[str, typer.Option(help="raster, stream, maptr, bevdet-occ or fb-occ; the table's own.")] = "",
     seeds: Annotated[int, typer.Option(min=1, help="Trainings of each row.")] = 3,
-    steps: Annotated[int, typer.Option(min=1, help="Of each training.")] = 600,
+    steps: Annotated[int, typer.Option(min=1, help="Of each training; line decoders take five times as many.")] = 600,
     test_stride: Annotated[int, typer.Option(min=1, help="Try every so many-th keyframe of the test drives.")] = 2,
     parallel: Annotated[int, typer.Option(min=1, help="Runs side by side, each on one processor.")] = 2,
 ) -> None:

@@ -117,6 +117,9 @@ def _facts(material: Material, scope: Scope) -> dict:
         "prior generations": material.priors.generations,
         "feature space": material.priors.space_id,
         "steps": scope.schedule.steps,
+        "disturbed in training": str(Run("raster").drop) + " " + str(Run("raster").noise),
+        "stream and maptr": "decoders that learn on the bird's-eye view of the raster mapper with the same senses and "
+        f"seed, which they keep; {scope.lines_schedule.steps} steps",
         "spread": "standard deviation over seeds",
         "frames/s": "of one processor core's own time: a window of the prior read, voxelised, the model, its output "
         "decoded; images were decoded before",
