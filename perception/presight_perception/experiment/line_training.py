@@ -36,6 +36,7 @@ class LineTraining(Training):
         model.bev.requires_grad_(False)
         super().__init__(run, task, material, model, checkpoint)
         self._lines_model, self._features = model, torch.empty(0)
+        self._truths: list[LineTruth] = [task.truth(model, keyframe) for keyframe in material.train]
 
     def _prepare(self, report: Report) -> None:
         """Make the features (draws, keyframes, channels, rows, columns) of all training keyframes."""
@@ -64,7 +65,7 @@ class LineTraining(Training):
         """Of every sample one of its draws, every other batch turned by half a circle, which no line minds."""
         draws = torch.randint(len(self._features), (len(rows),))
         features = self._features[draws, rows].float()
-        truths = [self._task.truth(self._model, self._material.train[row]) for row in rows]
+        truths = [self._truths[row] for row in rows]
         if torch.rand(()) < 0.5:
             features = features.flip(2, 3)
             truths = [LineTruth(truth.labels, 1 - truth.lines) for truth in truths]
