@@ -111,3 +111,10 @@ def test_a_feature_pixel_has_the_bin_of_its_nearest_known_depth():
     depth_m[0, 0, 0, 3] = 1.0  # the first bin's nearer face
     bins = depth_bins(depth_m, (2, 2), DepthBins(1.0, 11.0, 0.5))
     assert bins[0, 0].tolist() == [[8, 0], [-1, -1]]
+
+
+def test_weighted_voxels_count_as_often_as_their_classes_weigh():
+    logits, classes = torch.randn(6, 3), torch.tensor([0, 1, 1, 2, 2, 2])
+    rows = torch.tensor([0, 0, 0, 1, 2, 3, 4, 5])
+    weighted = cross_entropy_loss(logits, classes, torch.tensor([3.0, 1.0, 1.0]))
+    torch.testing.assert_close(weighted, cross_entropy_loss(logits[rows], classes[rows]))

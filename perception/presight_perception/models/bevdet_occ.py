@@ -19,6 +19,7 @@ from presight_perception.models.lift_splat import DepthBins, LiftSettings, LiftS
 from presight_perception.models.occ_blocks import LssPyramid3D, ResNet3D, ResNet3DSettings, SubvoxelHead
 from presight_perception.models.occ_frames import (
     CLASS_COUNT,
+    NUSCENES_VOXELS,
     OccupancyPredictions,
     OccupancyTarget,
     PastFrame,
@@ -35,6 +36,7 @@ from presight_perception.models.occ_model import (
     OnlineVoxels,
     image_size,
 )
+from presight_perception.occupancy_truth import FREE
 from presight_perception.voxelise import VoxelGrid
 
 
@@ -47,6 +49,7 @@ class BevDetOccSettings(OccupancySettings):
     blocks: tuple[int, ...] = (1, 2, 4)
     subdivision: int = 1  # predicted voxels along a side of the grid's
     depth_weight: float = 0.05
+    rarity: float = 0.0  # a class weighs 1 / (its voxels in nuScenes) ** rarity, free space 1; not in the original
 
     @staticmethod
     def paper(sources: Sources | None = None) -> "BevDetOccSettings":
@@ -66,11 +69,14 @@ class BevDetOccSettings(OccupancySettings):
             channels=(16, 24, 32),
             blocks=(1, 1, 1),
             subdivision=2,
+            rarity=0.5,  # or a short training finds nothing but ground and air
         )
 
 
 class BevDetOcc(OccupancyModel):
     """BEVDet-Occ."""
+
+    class_weights: Tensor
 
     def __init__(self, settings: BevDetOccSettings | None = None) -> None:
         self.settings = settings = settings or BevDetOccSettings()
@@ -85,6 +91,8 @@ class BevDetOcc(OccupancyModel):
         self.encoder = ResNet3D(ResNet3DSettings(self.channels, settings.channels, settings.blocks, strides))
         self.neck = LssPyramid3D(settings.channels, context)
         self.head = SubvoxelHead(context, CLASS_COUNT, settings.subdivision)
+        counts = torch.tensor(NUSCENES_VOXELS, dtype=torch.float32)
+        self.register_buffer("class_weights", (counts[FREE] / counts) ** settings.rarity, persistent=False)
 
     def see(self, images: Tensor, rig: CameraRig, history: Sequence[PastFrame]) -> OnlineVoxels:
         """Voxels of this frame and the earlier ones side by side."""
@@ -100,7 +108,7 @@ class BevDetOcc(OccupancyModel):
     def loss(self, predictions: OccupancyPredictions, truths: Sequence[OccupancyTarget]) -> dict[str, Tensor]:
         """Cross-entropy of the voxels that a camera saw, and of depth where the truth has it."""
         known, classes = known_voxels(predictions.logits, truths)
-        parts = {"classes": cross_entropy_loss(predictions.logits[known], classes)}
+        parts = {"classes": cross_entropy_loss(predictions.logits[known], classes, self.class_weights)}
         depth = lidar_loss(predictions.depth, truths, self.settings.lift.bins)
         return parts if depth is None else {**parts, "depth": self.settings.depth_weight * depth}
 

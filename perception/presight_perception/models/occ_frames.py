@@ -21,6 +21,11 @@ from presight_perception.voxelise import VoxelGrid
 
 CLASS_COUNT = len(OCCUPANCY_CLASSES)
 
+NUSCENES_VOXELS = (
+    944004, 1897170, 152386, 2391677, 16957802, 724139, 189027, 2074468, 413451, 2384460, 5916653, 175883646,
+    4275424, 51393615, 61411620, 105975596, 116424404, 1892500630,
+)  # fmt: skip  # of each class in Occ3D-nuScenes' training split: rare classes count more
+
 
 @dataclass(frozen=True)
 class PastFrame:

@@ -11,9 +11,10 @@ from torch.nn import functional
 LEAST_SHARE = 1e-5  # of a precision or recall, lest its logarithm be infinite
 
 
-def cross_entropy_loss(logits: Tensor, classes: Tensor) -> Tensor:
-    """The mean over voxels."""
-    return functional.cross_entropy(logits, classes, reduction="sum") / max(1, len(classes))
+def cross_entropy_loss(logits: Tensor, classes: Tensor, weights: Tensor | None = None) -> Tensor:
+    """The mean over voxels, weighted by those of their classes, if given."""
+    total = len(classes) if weights is None else weights[classes].sum().item()
+    return functional.cross_entropy(logits, classes, weights, reduction="sum") / max(1, total)
 
 
 def focal_loss(logits: Tensor, classes: Tensor, weights: Tensor, gamma: float = 2.0, alpha: float = 0.25) -> Tensor:
