@@ -291,7 +291,7 @@ class Run:
             "sky": weights.sky * sky,
             "distortion": weights.distortion * losses.distortion_loss(rendering.field.edges, rendering.field.weights),
         }
-        if trains_proposals:
+        if trains_proposals and rendering.proposals:
             parts["interlevel"] = weights.interlevel * _interlevel(rendering)
         return parts
 

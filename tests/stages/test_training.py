@@ -27,6 +27,16 @@ def test_training_lowers_the_loss(tmp_path):
     assert set(seen[-1].figures) == {"loss", "psnr_db", "rays_per_s", "waiting_share"}
 
 
+def test_a_field_may_do_without_proposals(tmp_path):
+    seen: list[Progress] = []
+    without = ("field.proposals=[]", "sampling.proposal_samples=[]", "sampling.field_samples=20")
+    trained = train_tile(
+        tiny_job("training.steps=60", "training.warmup=0.0", *without), Gradient(), tmp_path, seen.append
+    )
+    assert seen[-1].figures["loss"] < seen[1].figures["loss"] / 2
+    assert not any(name.startswith("proposals") for name in parameters_of(trained.folder))
+
+
 def test_an_interrupted_training_ends_as_an_uninterrupted_one(tmp_path):
     job = tiny_job()
     whole = train_tile(job, Gradient(), tmp_path / "whole")

@@ -16,6 +16,7 @@ from presight_perception.experiment.runs import (
     Schedule,
 )
 
+FB_OCC_RATE = 1e-2  # its focal loss starts with every class likely everywhere: at 3e-3 unlearning that takes 100 steps
 LINE_STEPS = 5  # of a decoder of lines for each step of the raster mapper that it learns from
 NOISE_M = (0.25, 0.5, 1.0)  # standard deviations of the vehicle's position (Table 6)
 
@@ -54,18 +55,17 @@ class Scope:
     def _run(self, model: ModelName, prior: PriorKind, seed: int) -> Run:
         if model in LINE_MODELS:
             return Run(model, prior, seed=seed, schedule=self.lines_schedule, masks=self.schedule)
-        schedule = self.voxels_schedule if model in OCCUPANCY_MODELS else self.schedule
+        schedule = self.schedule
+        if model in OCCUPANCY_MODELS:  # whose samples are large
+            schedule = replace(schedule, batch_size=2)
+        if model == "fb-occ":
+            schedule = replace(schedule, learning_rate=FB_OCC_RATE)
         return Run(model, prior, seed=seed, schedule=schedule)
 
     @property
     def lines_schedule(self) -> Schedule:
         """Of a decoder of lines that looks into a raster mapper's bird's-eye view."""
         return Schedule(LINE_STEPS * self.schedule.steps, 8, 1.5e-3)
-
-    @property
-    def voxels_schedule(self) -> Schedule:
-        """Of an occupancy model, whose samples are large."""
-        return replace(self.schedule, batch_size=2)
 
 
 def headline(scope: Scope) -> list[Row]:
