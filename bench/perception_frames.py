@@ -1,8 +1,8 @@
 """Frames a second of the perception models with and without a prior, reading and voxelising it included.
 
-Run with `python -m bench.perception_frames FOLDER [--size tiny] [--device cuda] [--rounds 3]`, FOLDER being one that
-`bench.prior_window` wrote, with perception/ on the path. With and without take turns, so that a busy machine harms both
-alike; medians. On a processor one thread works. Prints a table, and writes it as JSON to bench/out/.
+Run with `python -m bench.perception_frames STORE CITY [--size tiny] [--device cuda] [--rounds 3]`. Random headings at
+random places of mapped blocks. With and without take turns, so that a busy machine harms both alike; medians. On a
+processor one thread works. Prints a table, and writes it as JSON to bench/out/.
 """
 
 import argparse
@@ -11,13 +11,15 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import nn
 
+from bench.prior_window import street_poses
 from presight_core import frames
+from presight_core.priors import PriorReader
 from presight_perception.dataset import CityPriors, Place, PriorBatch, PriorDataset, PriorSettings, collate
 from presight_perception.models.bev_features import Sources
 from presight_perception.models.bevdet_occ import BevDetOcc, BevDetOccSettings
@@ -30,7 +32,6 @@ from presight_perception.models.stream_map_net import StreamMapNet, StreamMapNet
 Result = TypeVar("Result")
 
 CAMERAS = 6
-REACH_M = 150.0  # from the middle of the tile, so that windows are full
 IMAGES = {"paper": {"map": (450, 800), "occupancy": (256, 704)}, "tiny": {"map": (112, 200), "occupancy": (128, 352)}}
 MODELS = {
     "RasterMapper": (RasterMapper, RasterMapperSettings, "map"),
@@ -41,10 +42,19 @@ MODELS = {
 }
 
 
+class Case(NamedTuple):
+    """What is measured."""
+
+    model: str
+    size: str
+    device: torch.device
+
+
 def main() -> None:
     """Print and write a line for each model."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("store")
+    parser.add_argument("city")
     parser.add_argument("--models", nargs="+", default=list(MODELS), choices=list(MODELS))
     parser.add_argument("--size", default="paper", choices=list(IMAGES))
     parser.add_argument("--device", default="cpu")
@@ -53,25 +63,26 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = []
     for name in chosen.models:
-        rows.append(measure(name, chosen.size, chosen.folder, torch.device(chosen.device), chosen.rounds))
+        case = Case(name, chosen.size, torch.device(chosen.device))
+        rows.append(measure(case, chosen.store, chosen.city, chosen.rounds))
         print("  ".join(f"{key} {value:.1f}" if isinstance(value, float) else value for key, value in rows[-1].items()))
     out = Path(__file__).parent / "out" / f"perception_frames_{chosen.size}_{chosen.device}.json"
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
-def measure(name: str, size: str, folder: Path, device: torch.device, rounds: int) -> dict[str, str | float]:
+def measure(case: Case, store: str, city: str, rounds: int) -> dict[str, str | float]:
     """Milliseconds of a frame without and with prior, and of the prior's parts."""
-    model, settings, kind = MODELS[name]
-    priors = CityPriors(folder, {"town": None})
+    (model, settings, kind), device = MODELS[case.model], case.device
+    priors = CityPriors(store, {city: None})
     sources = Sources(prior_channels=4 + priors.channel_count)
-    plain = model(getattr(settings, size)(Sources())).eval().to(device)
-    fused = model(getattr(settings, size)(sources)).eval().to(device)
+    plain = model(getattr(settings, case.size)(Sources())).eval().to(device)
+    fused = model(getattr(settings, case.size)(sources)).eval().to(device)
     grid = fused.bev.settings.grid.prior_grid if kind == "map" else fused.common.prior_grid
-    random = np.random.default_rng(0)
-    poses = [frames.planar_transform(*random.uniform(-REACH_M, REACH_M, 2), 0.0) for _ in range(rounds + 1)]
-    samples = PriorDataset(priors, [Place("town", pose) for pose in poses], PriorSettings(grid))
-    online = _images(IMAGES[size][kind], device), _rig(IMAGES[size][kind]).to(device)
+    poses = street_poses(PriorReader.open(store, city), rounds + 1)
+    samples = PriorDataset(priors, [Place(city, pose) for pose in poses], PriorSettings(grid))
+    size = IMAGES[case.size][kind]
+    online = _images(size, device), _rig(size).to(device)
     took: dict[str, list[float]] = {"plain": [], "load": [], "fused": []}
     with torch.inference_mode():
         for index in range(rounds + 1):  # the first warms up
@@ -82,7 +93,7 @@ def measure(name: str, size: str, folder: Path, device: torch.device, rounds: in
                 took[part].append(value)
     plain_ms, load_ms, fused_ms = (float(np.median(took[part][1:])) for part in ("plain", "load", "fused"))
     return {
-        "model": name,
+        "model": case.model,
         "without_ms": plain_ms,
         "read_and_voxelise_ms": load_ms,
         "fusion_ms": fused_ms - plain_ms,
