@@ -130,6 +130,7 @@ class TrainingSettings(Settings):
     anneal: Share = 0.1  # share of the steps over which proposal weights sharpen
     thin_weight: Annotated[float, Field(ge=1)] = 1.0  # how much likelier pixels of poles, signs and fences are drawn
     fade_m: Annotated[float, Field(ge=0)] = 0.0  # nearer than this, gradients fade with the square of the distance
+    features_shape: bool = True  # whether features decide where surfaces are, or colours alone
     image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     keyframes_only: bool = False
     holdout_every: Annotated[int, Field(ge=0)] = 8  # every 8th frame of a camera is kept for evaluation; 0: none

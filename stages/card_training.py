@@ -80,7 +80,13 @@ class CardRun(Run):
     def _body(self, trains_proposals: bool) -> Losses:
         draws, jitter = self._noise.split([DRAWS, self.passes], -1)
         rays, targets = self.pool.draw(draws)
-        sampling = Sampling(jitter, self._anneal, trains_proposals, fade_m=self._settings.fade_m)
+        sampling = Sampling(
+            jitter,
+            self._anneal,
+            trains_proposals,
+            fade_m=self._settings.fade_m,
+            features_shape=self._settings.features_shape,
+        )
         if self._card_ground is None:
             return self._descend(rays, targets, sampling)
         start_m, end_m = self._card_ground.stretches(rays, targets.labels)

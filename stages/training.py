@@ -209,7 +209,13 @@ class Run:
         targets = Targets(
             *(torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.labels, batch.features))
         )
-        sampling = Sampling(jitter, exponent, trains_proposals, fade_m=self._settings.fade_m)
+        sampling = Sampling(
+            jitter,
+            exponent,
+            trains_proposals,
+            fade_m=self._settings.fade_m,
+            features_shape=self._settings.features_shape,
+        )
         if self._ground is None:
             return self._descend(self._rays(batch), targets, sampling)
         start_m, end_m = (torch.from_numpy(value).to(self._job.device) for value in self._ground.stretches(batch))

@@ -75,6 +75,7 @@ class Sampling:
     train_proposals: bool = False
     left: float = 0.0  # a ray is followed until this share of it is left; the proposals' samples beyond weigh nothing
     fade_m: float = 0.0  # samples nearer to the camera than this learn less; see `fade_gradient`
+    features_shape: bool = True  # False: density learns nothing from rendered features
 
 
 @dataclass(frozen=True)
@@ -210,9 +211,10 @@ class TileField(nn.Module):
         weights = rendering.ray_weights(values.density, edges_m.diff(dim=-1))
         behind = 1 - weights.sum(-1, keepdim=True)
         sky_rgb, sky_features = self._sky(rays, conditions)
+        shares = (weights, behind) if sampling.features_shape else (weights.detach(), behind.detach())
         return Rendering(
             rendering.blend(weights, values.rgb) + behind * sky_rgb,
-            rendering.blend(weights, values.features) + behind * sky_features,
+            rendering.blend(shares[0], values.features) + shares[1] * sky_features,
             edges_m,
             Histogram(edges, weights),
             proposals,

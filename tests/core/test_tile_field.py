@@ -101,6 +101,20 @@ def test_fading_changes_what_a_field_learns_but_not_what_it_shows():
     assert 0 < weak < strong / 10
 
 
+def test_features_need_not_decide_where_surfaces_are():
+    field = small_field()
+    rays = field.rays(*random_rays(50))
+    shaping, following = field(rays), field(rays, Sampling(features_shape=False))
+    assert torch.equal(shaping.features, following.features)
+    pulls = [
+        torch.autograd.grad(seen.features.sum(), seen.field.weights, allow_unused=True)[0]
+        for seen in (shaping, following)
+    ]
+    assert pulls[0] is not None
+    assert pulls[1] is None
+    assert torch.autograd.grad(following.rgb.sum(), following.field.weights)[0].any(), "colours still do"
+
+
 def test_copies_of_tables_are_read_and_follow_the_tables():
     field, rays = small_field(), random_rays(5)
     exact = field(field.rays(*rays)).rgb
