@@ -52,9 +52,10 @@ def measure(layout: GridLayout, options: argparse.Namespace) -> dict[str, list[f
     table = torch.rand(layout.table_rows, layout.features).numpy()
     gradient = torch.empty_like(torch.from_numpy(table)).numpy()
     encoded = torch.empty(len(points), layout.output_width).numpy()
-    rows = table_rows(points, offsets, levels)
-    grid = (points, segments, table, offsets, levels, encoded, 1)
-    backward = (points, segments, encoded, offsets, levels, gradient, 1)
+    by_axis = np.ascontiguousarray(points.T)
+    rows = table_rows(by_axis, offsets, levels)
+    grid = (by_axis, segments, table, offsets, levels, encoded, 1)
+    backward = (by_axis, segments, encoded, offsets, levels, gradient, 1)
     variants: dict[str, Callable[[], None]] = {
         "encode": lambda: numba_kernels.encode(*grid),
         "limit": lambda: gather(rows, table.reshape(-1), encoded.reshape(-1), len(levels)),
@@ -82,12 +83,12 @@ def rays_points(count: int) -> NDArray[np.float32]:
 @numba.njit(cache=True)
 def table_rows(points, offsets, levels):
     """Rows (levels, blocks, 8, BLOCK) of the whole table that the encoding reads."""
-    blocks = len(points) // BLOCK
+    blocks = points.shape[1] // BLOCK
     rows = np.empty((len(levels), blocks, 8, BLOCK), np.uint32)
     for level in range(len(levels)):
-        scratch = numba_kernels._scratch()
+        scratch = numba_kernels.corner_scratch()
         for block in range(blocks):
-            numba_kernels._corners(points[block * BLOCK : (block + 1) * BLOCK], levels[level], scratch)
+            numba_kernels._corners(points, block * BLOCK, BLOCK, levels[level], scratch)
             rows[level, block] = scratch[0] + np.uint32(offsets[0, level])
     return rows
 

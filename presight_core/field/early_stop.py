@@ -18,7 +18,7 @@ def weights_until(density_at: Callable[[Tensor], Tensor], rays: Rays, edges_m: T
 
     Behind a surface there is nothing to see, and half of all samples lie there. Without gradients.
     """
-    stage = max(MIN_SAMPLES, edges_m.shape[1] // STAGES)
+    stage = samples_of_stage(edges_m.shape[1] - 1)
     density = torch.zeros_like(edges_m[:, 1:])
     followed, optical = torch.arange(len(edges_m), device=edges_m.device), edges_m.new_zeros(len(edges_m))
     for first in range(0, density.shape[1], stage):
@@ -31,3 +31,8 @@ def weights_until(density_at: Callable[[Tensor], Tensor], rays: Rays, edges_m: T
         if not len(followed):
             break
     return ray_weights(density, edges_m.diff(dim=-1))
+
+
+def samples_of_stage(bins: int) -> int:
+    """How many samples of a ray with so many are looked at before asking whether to go on."""
+    return max(MIN_SAMPLES, bins // STAGES)

@@ -4,8 +4,9 @@ Sub-fields, each a hash grid with its own small networks, share a sky, two propo
 the embeddings of videos and images. A sample belongs to the sub-field with the nearest centroid.
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from presight_core.config import FieldSettings, GridSettings, SamplingSettings
-from presight_core.field import rendering, samplers
+from presight_core.field import ray_density, rendering, samplers
 from presight_core.field.assignment import Assignment, assign
 from presight_core.field.contraction import grid_position, grid_positions
 from presight_core.field.early_stop import weights_until
@@ -239,7 +240,8 @@ class TileField(nn.Module):
         jitter = [None] * len(counts) if sampling.jitter is None else sampling.jitter.split(1, -1)
         edges = samplers.uniform_edges(len(rays.origins), counts[0], jitter[0], rays.origins)
         histograms, spacing = [], self.spacing(rays)
-        for number, (proposal, count) in enumerate(zip(self.proposals, counts[1:], strict=True), 1):
+        proposals = cast("Iterable[DensityNetwork]", self.proposals)
+        for number, (proposal, count) in enumerate(zip(proposals, counts[1:], strict=True), 1):
             edges_m = spacing.metres(edges)
             with torch.set_grad_enabled(sampling.train_proposals and torch.is_grad_enabled()):
                 weights = self._weights(proposal, rays, edges_m, sampling.left)
@@ -291,10 +293,17 @@ class TileField(nn.Module):
         ]
         return torch.cat([spherical_harmonics(rays.directions), *embeddings], -1)
 
-    def _weights(self, network: nn.Module, rays: Rays, edges_m: Tensor, left: float) -> Tensor:
+    def _weights(self, network: DensityNetwork, rays: Rays, edges_m: Tensor, left: float) -> Tensor:
+        if ray_density.suits(network.grid, edges_m):
+            density = self._ray_density(network, rays, edges_m, left)
+            return rendering.ray_weights(density, edges_m.diff(dim=-1))
         if left:
             return weights_until(lambda points: self._density(network, points), rays, edges_m, left)
         return rendering.ray_weights(self._density(network, rays.points(edges_m)), edges_m.diff(dim=-1))
+
+    def _ray_density(self, network: DensityNetwork, rays: Rays, edges_m: Tensor, left: float) -> Tensor:
+        boxes, bias = (self.centroids, self.box_centre, self.box_half), self.shape.settings.density_bias
+        return ray_density.ray_density(network.grid, network.network, boxes, rays, edges_m, bias, left)
 
     def _density(self, network: nn.Module, points: Tensor) -> Tensor:
         assignment, positions, inside = self._locate(points)

@@ -47,6 +47,9 @@ class Wall(TileField):
     def _density(self, network, points):
         return torch.where(points[..., 0] + self.origin_m[0] > EAST_M + 8, 50.0, 0.0)
 
+    def _ray_density(self, network, rays, edges_m, left):
+        return self._density(network, rays.points(edges_m))
+
 
 def test_rendering_has_a_row_for_each_ray():
     field = small_field()

@@ -1,5 +1,6 @@
 """Reading for weeks: neither files nor memory are left behind."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -20,6 +21,7 @@ def many_windows_leak_nothing(empty_town, monkeypatch, count: int) -> None:
     reader = PriorReader.open(empty_town.location, "town", cache_bytes=6_000)  # a chunk or two: most are read anew
     random = np.random.default_rng(0)
     reader.window(frames.planar_transform(3.0, -2.0, 0.0))
+    gc.collect()  # what earlier tests left open
     before = open_files()
     most_memory = 0
     for number in range(count):
@@ -27,7 +29,7 @@ def many_windows_leak_nothing(empty_town, monkeypatch, count: int) -> None:
         reader.window(pose, (-3.0, 3.0), (-3.0, 3.0))
         if number == count // 10:
             most_memory = resident_bytes()
-    assert open_files() == before
+    assert open_files() <= before
     assert resident_bytes() < most_memory + 2e6 + 40 * count  # a window holds more than 2 kB, a chunk 1 kB
 
 

@@ -1,9 +1,9 @@
 """The hash encoding on a CPU.
 
-Points go through in blocks: the index arithmetic of a block becomes vector instructions, and its eight
-corner rows are then fetched point by point. Levels are the outer loop, so that one level's rows stay in
-the cache. Rows of four features move as one vector, through two small LLVM intrinsics: twice as fast as
-four scalars.
+Points (3, N), one axis after the other, go through in blocks: the index arithmetic of a block becomes vector
+instructions, and its eight corner rows are then fetched point by point. Levels are the outer loop, so that
+one level's rows stay in the cache. Rows of four features move as one vector, through two small LLVM
+intrinsics: twice as fast as four scalars.
 
 `levels` rows are (resolution, row count, hashed or dense); see `GridLayout.levels`.
 """
@@ -24,69 +24,76 @@ INT64 = ir.IntType(64)
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def encode(points, segments, table, offsets, levels, output, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
-    """Fill output (N, levels * features). Workers take equal shares of the points."""
-    features = table.shape[1]
-    flat_table, flat_output = table.reshape(-1), output.reshape(-1)
-    share = (len(points) + worker_count - 1) // worker_count
+    """Fill output (N, levels * features). Workers take equal shares of the points (3, N)."""
+    count = points.shape[1]
+    share = (count + worker_count - 1) // worker_count
     for worker in prange(worker_count):
-        scratch = _scratch()
-        rows, weights, _, _ = scratch
+        scratch = corner_scratch()
         for level in range(len(levels)):
             for sub_field in range(len(offsets)):
                 first = max(segments[sub_field], worker * share)
                 last = min(segments[sub_field + 1], (worker + 1) * share)
-                start = offsets[sub_field, level] * features
-                level_table = flat_table[start : start + levels[level, 1] * features]
-                column = level * features
-                for low in range(first, last, BLOCK):
-                    count = min(BLOCK, last - low)
-                    _corners(points[low : low + count], levels[level], scratch)
-                    _prefetch(level_table, rows, features, count)
-                    if features == 4:
-                        for i in range(count):
-                            _gather_rows(  # pyright: ignore[reportCallIssue] - numba adds the first argument
-                                flat_output, (low + i) * output.shape[1] + column, level_table, rows, weights, i
-                            )
-                    else:
-                        _gather_scalars(output[low : low + count, column : column + features], level_table, scratch)
+                start = offsets[sub_field, level]
+                level_table = table[start : start + levels[level, 1]]
+                encode_rows(points, first, last, levels[level], level_table, output, level * table.shape[1], scratch)
+
+
+@numba.njit(fastmath=True)
+def encode_rows(points, first, last, level, level_table, output, column, scratch):  # noqa: PLR0913, PLR0917 - likewise
+    """Fill a level's columns of output[first:last], for points that all belong to the sub-field of `level_table`."""
+    features = level_table.shape[1]
+    flat_table, flat_output = level_table.reshape(-1), output.reshape(-1)
+    rows, weights, _, _ = scratch
+    for low in range(first, last, BLOCK):
+        count = min(BLOCK, last - low)
+        _corners(points, low, count, level, scratch)
+        _prefetch(flat_table, rows, features, count)
+        if features == 4:
+            for i in range(count):
+                _gather_rows(  # pyright: ignore[reportCallIssue] - numba adds the first argument
+                    flat_output, (low + i) * output.shape[1] + column, flat_table, rows, weights, i
+                )
+        else:
+            _gather_scalars(output, low, count, column, level_table, scratch)
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def table_gradient(points, segments, gradient, offsets, levels, result, worker_count):  # noqa: PLR0913, PLR0917 - likewise
-    """Fill result (rows, features). An item of work is a level of a sub-field, which owns its rows.
+    """Fill result (rows, features), of points (3, N). An item of work is a level of a sub-field, which owns its rows.
 
     So there are no atomics and no copies, and the sum is the same whatever the number of threads. A level
     is zeroed just before it is added to, while it is in the cache.
     """
     features = result.shape[1]
-    flat_result, flat_gradient = result.reshape(-1), gradient.reshape(-1)
+    flat_gradient = gradient.reshape(-1)
     level_count = len(levels)
     item_count = len(offsets) * level_count
     for worker in prange(worker_count):
-        scratch = _scratch()
+        scratch = corner_scratch()
         rows, weights, _, _ = scratch
         for item in range(worker, item_count, worker_count):  # interleaved: fine levels cost more than coarse ones
             sub_field, level = item // level_count, item % level_count
-            start = offsets[sub_field, level] * features
-            level_table = flat_result[start : start + levels[level, 1] * features]
-            level_table[:] = 0
+            start = offsets[sub_field, level]
+            level_table = result[start : start + levels[level, 1]]
+            flat_table = level_table.reshape(-1)
+            flat_table[:] = 0
             column = level * features
             last = segments[sub_field + 1]
             for low in range(segments[sub_field], last, BLOCK):
                 count = min(BLOCK, last - low)
-                _corners(points[low : low + count], levels[level], scratch)
-                _prefetch(level_table, rows, features, count)
+                _corners(points, low, count, levels[level], scratch)
+                _prefetch(flat_table, rows, features, count)
                 if features == 4:
                     for i in range(count):
                         _scatter_rows(  # pyright: ignore[reportCallIssue] - likewise
-                            level_table, flat_gradient, (low + i) * gradient.shape[1] + column, rows, weights, i
+                            flat_table, flat_gradient, (low + i) * gradient.shape[1] + column, rows, weights, i
                         )
                 else:
-                    _scatter_scalars(level_table, gradient[low : low + count, column : column + features], scratch)
+                    _scatter_scalars(level_table, gradient, low, count, column, scratch)
 
 
 @numba.njit(inline="always")
-def _scratch():
+def corner_scratch():
     """Corner rows (8, BLOCK), their weights (8, BLOCK), the cell (3, BLOCK) and the place in it (3, BLOCK)."""
     return (
         np.empty((8, BLOCK), np.uint32),
@@ -97,21 +104,21 @@ def _scratch():
 
 
 @numba.njit(inline="always", fastmath=True)
-def _corners(points, level, scratch):
-    """Fill rows and weights of the eight corners around each point of a block."""
+def _corners(points, low, count, level, scratch):
+    """Fill rows and weights of the eight corners around each of points[:, low : low + count]."""
     _, _, cell, fraction = scratch
     resolution = np.float32(level[0])
-    for i in range(len(points)):
-        for axis in range(3):
-            scaled = points[i, axis] * resolution
+    for axis in range(3):
+        for i in range(count):
+            scaled = points[axis, low + i] * resolution
             floor = np.int32(scaled)  # points are not negative
             cell[axis, i] = np.uint32(floor)
             fraction[axis, i] = scaled - np.float32(floor)
     if level[2]:
-        _hashed_rows(len(points), np.uint32(level[1] - 1), scratch)
+        _hashed_rows(count, np.uint32(level[1] - 1), scratch)
     else:
-        _dense_rows(len(points), np.uint32(level[0] + 1), np.uint32(level[1] - 1), scratch)
-    _trilinear_weights(len(points), scratch)
+        _dense_rows(count, np.uint32(level[0] + 1), np.uint32(level[1] - 1), scratch)
+    _trilinear_weights(count, scratch)
 
 
 @numba.njit(inline="always", fastmath=True)
@@ -171,26 +178,24 @@ def _trilinear_weights(count, scratch):
 
 
 @numba.njit(inline="always", fastmath=True)
-def _gather_scalars(output, level_table, scratch):
+def _gather_scalars(output, low, count, column, level_table, scratch):
     rows, weights, _, _ = scratch
-    count, features = output.shape
-    for feature in range(features):
+    for feature in range(level_table.shape[1]):
         for i in range(count):
             total = np.float32(0)
             for k in range(8):
-                total += weights[k, i] * level_table[rows[k, i] * features + feature]
-            output[i, feature] = total
+                total += weights[k, i] * level_table[rows[k, i], feature]
+            output[low + i, column + feature] = total
 
 
 @numba.njit(inline="always", fastmath=True)
-def _scatter_scalars(level_table, gradient, scratch):
+def _scatter_scalars(level_table, gradient, low, count, column, scratch):
     rows, weights, _, _ = scratch
-    count, features = gradient.shape
     for i in range(count):
-        for feature in range(features):
-            upstream = gradient[i, feature]
+        for feature in range(level_table.shape[1]):
+            upstream = gradient[low + i, column + feature]
             for k in range(8):
-                level_table[rows[k, i] * features + feature] += weights[k, i] * upstream
+                level_table[rows[k, i], feature] += weights[k, i] * upstream
 
 
 @numba.njit(inline="always")
