@@ -50,11 +50,11 @@ def main() -> None:
 def speed(field: TileField, rounds: int) -> dict[str, float]:
     """Rays a processor second of training's forward pass, gradients recorded, and of the surfaces."""
     origins, directions = random_rays(field)
-    numbers = np.zeros(RAYS, np.int64)
+    numbers, passes = np.zeros(RAYS, np.int64), len(field.proposals) + 1
     rates: dict[str, list[float]] = {"forward": [], "first-hit": [], "expected": []}
     for _ in range(rounds + 1):
         started = time.process_time()
-        seen = field(field.rays(origins, directions, numbers, numbers), Sampling(torch.Generator()))
+        seen = field(field.rays(origins, directions, numbers, numbers), Sampling(torch.rand(RAYS, passes)))
         rates["forward"].append(RAYS / (time.process_time() - started))
         del seen
         for rule in ("first-hit", "expected"):

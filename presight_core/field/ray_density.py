@@ -86,6 +86,7 @@ def _layers(network: SubFieldMlp) -> tuple[np.ndarray, ...]:
     return _arrays(*(functional.pad(value, padding) for value in values), network.biases[1][:, 0])
 
 
+# Numba's cache sees changes of this file only: after one of `encode_rows`, touch it.
 @numba.njit(parallel=True, cache=True, error_model="numpy", fastmath=FAST)
 def _fill(rays, boxes, grid, layers, density_bias, most, stage, density, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
     """Workers take equal shares of the rays."""

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from presight_core.config import TrainingSettings
-from presight_core.field import losses, rendering, samplers, schedule
+from presight_core.field import losses, rendering, samplers, schedule, threads
 from presight_core.field.assignment import Assignment, assign
 from presight_core.field.contraction import contract, grid_position, grid_positions
 from presight_core.field.early_stop import weights_until
@@ -325,3 +325,10 @@ def test_following_rays_to_their_end_gives_the_weights_of_all_samples_in_front()
     torch.testing.assert_close(found, plain, atol=1e-3, rtol=0)
     assert looked_at_early < 3 * 40
     assert not found[0, 20:].any()
+
+
+@pytest.mark.parametrize("has_tiles", [True, False])
+def test_a_processor_calculates_in_bfloat16_only_if_it_has_tile_registers(monkeypatch, has_tiles):
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: has_tiles)
+    assert threads.has_fast_bfloat16("cpu") is has_tiles
