@@ -97,13 +97,14 @@ def _fill(rays, boxes, grid, layers, density_bias, most, stage, density, worker_
         work = _work(max(POINTS, stage), len(boxes[0]), layers)
         end = min((worker + 1) * share, ray_count)
         for first in range(worker * share, end, step):
-            followed = np.arange(first, min(first + step, end))
-            _follow(rays, followed, boxes, grid, layers, density_bias, most, stage, density, work)
+            last = min(first + step, end)
+            _follow(rays, first, last, boxes, grid, layers, density_bias, most, stage, density, work)
 
 
 @numba.njit(error_model="numpy")
-def _follow(rays, followed, boxes, grid, layers, density_bias, most, stage, density, work):  # noqa: PLR0913, PLR0917 - likewise
-    """Rays through one stage after the other, as long as less than `most` optical depth is behind them."""
+def _follow(rays, first, last, boxes, grid, layers, density_bias, most, stage, density, work):  # noqa: PLR0913, PLR0917 - likewise
+    """Rays first..last through a stage after the other, as long as less than `most` optical depth is behind them."""
+    followed = np.arange(first, last)
     optical = np.zeros(len(followed), np.float32)
     for low in range(0, density.shape[1], stage):
         high = min(low + stage, density.shape[1])
