@@ -131,6 +131,7 @@ def tile_jobs(workspace: Workspace, plan: CityPlan, order: Order, lease: Lease) 
             device=order.devices[index % len(order.devices)],
             drive_ids=tile.drive_ids,
             tile=tile.tile,
+            tile_id=tile.tile_id,
             training_recipe=training.to_json(),
             recipe=whole.to_json(),
         )
@@ -146,7 +147,7 @@ def _job(workspace: Workspace, plan: CityPlan, build_id: int, threads: int) -> J
         threads=threads,
         space_id=plan.space_id or "",
         features_recipe=plan.features.to_json() if plan.features else {},
-        tiling=plan.tiling.to_json(),
+        tiling_id=plan.tiling.tiling_id,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from presight_core.config import CitySettings, validate
 from presight_core.drives import FrameTable
+from presight_core.errors import ConflictError
 from presight_core.recipes import Recipe
 from presight_core.tiles import Tiling
 from storage.workspace import Workspace
@@ -25,20 +26,19 @@ class Job:
     space_id: str = ""
     features_recipe: dict[str, Any] = field(default_factory=dict)
     drive_ids: tuple[str, ...] = ()
-    tiling: dict[str, Any] = field(default_factory=dict)  # Tiling as JSON values
+    tiling_id: str = ""
     tile: int = 0  # index in the tiling
+    tile_id: str = ""
     training_recipe: dict[str, Any] = field(default_factory=dict)
     recipe: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def tile_id(self) -> str:
-        """The tile's name."""
-        return self.opened_tiling.tiles[self.tile].tile_id
-
-    @property
     def opened_tiling(self) -> Tiling:
-        """The city's tiling."""
-        return Tiling.from_json(self.tiling)
+        """The city's tiling. Raises ConflictError if it is not the one that the job was made for."""
+        tiling = self.opened_workspace.catalog().tiling(self.city)
+        if tiling is None or tiling.tiling_id != self.tiling_id:
+            raise ConflictError(f"{self.city}: its tiles were cut anew since this build began; build it again")
+        return tiling
 
     @property
     def opened_settings(self) -> CitySettings:

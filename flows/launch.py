@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 from flows.jobs import Job
@@ -27,8 +28,8 @@ def run_job(command: str, job: Job, report: Report = silent) -> dict[str, Any]:
     last_lines: deque[str] = deque(maxlen=KEPT_LINES)
     outcome: dict[str, Any] = {}
     with subprocess.Popen(
-        [*WORKER, command, job.to_json()],
-        stdin=subprocess.PIPE,  # stays open while we live: the worker ends when it closes
+        [*WORKER, command],
+        stdin=subprocess.PIPE,  # brings the job; then stays open while we live: the worker ends when it closes
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -36,6 +37,7 @@ def run_job(command: str, job: Job, report: Report = silent) -> dict[str, Any]:
     ) as process:
         assert process.stdout is not None
         try:
+            _hand_over(job, process)
             for line in process.stdout:
                 message = _message(line)
                 if message is None:
@@ -59,6 +61,17 @@ def worker_environment(threads: int) -> dict[str, str]:
     """The environment of a worker: thread counts that agree, and threads that sleep rather than spin."""
     counts = {name: str(threads) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
     return {**os.environ, **counts, "OMP_WAIT_POLICY": "passive", "PYTHONUNBUFFERED": "1"}
+
+
+def _hand_over(job: Job, process: subprocess.Popen[str]) -> None:
+    """Write the job to the worker: as an argument, it could not exceed 128 KiB, some 2,000 drives."""
+    assert process.stdin is not None
+    try:
+        process.stdin.write(job.to_json() + "\n")
+        process.stdin.flush()
+    except BrokenPipeError:  # it is dead already: its status and last words tell why
+        with suppress(BrokenPipeError):
+            process.stdin.close()
 
 
 def _message(line: str) -> dict[str, Any] | None:

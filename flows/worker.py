@@ -1,7 +1,7 @@
 """The worker process: does one job and speaks JSON lines on its standard output.
 
-`python -m flows.worker COMMAND JOB`; messages are {"progress": ...}, then {"result": ...} or {"error": ...}.
-It ends when its standard input closes, so that no worker outlives a killed build.
+`python -m flows.worker COMMAND`; the job is a line on its standard input, messages are {"progress": ...}, then
+{"result": ...} or {"error": ...}. It ends when that input closes, so that no worker outlives a killed build.
 """
 
 import json
@@ -104,7 +104,8 @@ def fit_space(job: Job) -> dict[str, Any]:
     from stages.space_fitting import SpaceImages, fit_space
 
     workspace, settings = job.opened_workspace, job.opened_settings
-    drives = [drive for drive in workspace.catalog().drives(job.city) if drive.drive_id in job.drive_ids]
+    wanted = set(job.drive_ids)
+    drives = [drive for drive in workspace.catalog().drives(job.city) if drive.drive_id in wanted]
     index = workspace.drives()
     images = SpaceImages((drive, drive_frames(index, drive.drive_id, settings)) for drive in drives)
     space = fit_space(images, FeatureExtractor.load(settings.features, job.threads), settings.features, say)
@@ -195,11 +196,12 @@ COMMANDS: dict[str, Callable[[Job], dict[str, Any]]] = {
 }
 
 
-def main(command: str, job: str) -> int:
+def main(command: str) -> int:
     """Do one job; 0 if it gave a result."""
+    job = Job.from_json(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        _send({"result": COMMANDS[command](Job.from_json(job))})
+        _send({"result": COMMANDS[command](job)})
     except PresightError as error:
         _send({"error": {"name": type(error).__name__, "message": str(error)}})
         return error.exit_code

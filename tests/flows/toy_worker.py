@@ -77,7 +77,7 @@ def _end_with_parent() -> None:
 
 
 if __name__ == "__main__":
+    job = Job.from_json(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    job = Job.from_json(sys.argv[2])
     work = {"train": train, "extract": extract, "features": features}[sys.argv[1]]
     _send({"result": work(job, Path(job.workspace))})
