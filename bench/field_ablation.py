@@ -23,6 +23,7 @@ VARIANTS: dict[str, list[str]] = {
     "no features": ["training.loss.features=0.0"],
     "no floor": ["sampling.floor_m=1000.0"],
     "no ground": ["training.ground.weight=0.0"],
+    "no stereo": ["training.stereo.weight=0.0"],
     "no thin weight": ["training.thin_weight=1.0"],
 }
 COLUMNS = ("steps", "minutes", "psnr_db", "psnr_own_video_db", "feature_rmse", "found_share", "sky_share")

@@ -14,7 +14,7 @@ from presight_core.pixels import PixelSource
 from stages.extraction import TileExtraction
 from stages.feeding import Feed
 from stages.tiling import sub_fields
-from stages.training import Run, TileTraining, training_rows
+from stages.training import Run, TileTraining, known_depths, training_rows
 from storage.pixels import CachedPixels
 from storage.workspace import Workspace
 
@@ -51,9 +51,10 @@ def train(tile: BenchTile, marks: list[int]) -> Iterator[tuple[int, float, TileF
     """The field after the steps of `marks` and at the end, with the processor minutes that training took so far."""
     settings = tile.job.settings.training
     with tempfile.TemporaryDirectory() as scratch:
-        run = Run(tile.job, Path(scratch))
+        rows = training_rows(tile.job.frames, settings)
         spent, started = 0.0, time.process_time()
-        with Feed(tile.job, tile.source, training_rows(tile.job.frames, settings)) as feed:
+        run = Run(tile.job, Path(scratch), known_depths(tile.job, tile.source, rows, Path(scratch)))
+        with Feed(tile.job, tile.source, rows) as feed:
             for step in range(settings.steps):
                 run.train(step, feed.batch(step))
                 if step + 1 in marks or step + 1 == settings.steps:

@@ -117,6 +117,14 @@ class GroundSettings(Settings):
     reach_m: Metres = 20.0  # only ground this near to a camera, on the map, is known
 
 
+class StereoSettings(Settings):
+    """How far surfaces are, from neighbouring images alone, before training (`stages/stereo.py`). Not of the paper."""
+
+    weight: Annotated[float, Field(ge=0)] = 0.0  # of the loss; 0: nothing is known, as in the paper
+    tolerance: Share = 0.03  # of the distance: rays end within it
+    width_px: Count = 400  # at which images are compared
+
+
 class TrainingSettings(Settings):
     """How a tile's field is optimised."""
 
@@ -139,6 +147,7 @@ class TrainingSettings(Settings):
     seed: int = 0
     loss: LossSettings = LossSettings()
     ground: GroundSettings = GroundSettings()
+    stereo: StereoSettings = StereoSettings()
 
 
 class ExtractionSettings(Settings):

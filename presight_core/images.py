@@ -91,6 +91,13 @@ def resized(rgb: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np
     return cv2.resize(rgb, (width_px, height_px), interpolation=method).astype(np.uint8, copy=False)
 
 
+def grey_level(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The brightness (H, W) of an image, smoothed over three pixels: for comparing images, not for looking at."""
+    import cv2
+
+    return cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (3, 3), 0).astype(np.uint8, copy=False)
+
+
 def _content(file: Path, what: str, cure: str) -> NDArray[np.uint8]:
     try:
         return np.fromfile(file, np.uint8)

@@ -22,6 +22,7 @@ from presight_core.pixels import PixelSource
 from stages.card_ground import CardGround
 from stages.card_pool import CardPool, Choice, PoolFrames
 from stages.feeding import POOL_STEPS
+from stages.stereo import KnownDepths
 from stages.training import Run, TileTraining
 
 EAGER_STEPS = 3  # of each kind before it is recorded: kernels get compiled, and the optimiser's state made
@@ -37,9 +38,15 @@ class CardRun(Run):
     """
 
     def __init__(
-        self, job: TileTraining, scratch: Path, source: PixelSource, rows: NDArray[np.int64], replays: bool = True
+        self,
+        job: TileTraining,
+        scratch: Path,
+        source: PixelSource,
+        rows: NDArray[np.int64],
+        replays: bool = True,
+        depths: KnownDepths | None = None,
     ) -> None:
-        super().__init__(job, scratch)
+        super().__init__(job, scratch, depths)
         choice = Choice(job.settings.features.dynamic_classes, self._settings.thin_weight, self._settings.seed)
         self.pool = CardPool(self._pool_frames(rows), source, choice, job.device, job.threads)
         positions, ground = job.frames.positions, self._settings.ground

@@ -29,6 +29,7 @@ from stages.card_pool import Targets
 from stages.feeding import Feed
 from stages.ground import Ground
 from stages.ray_pool import PixelBatch
+from stages.stereo import Images, KnownDepths, depth_maps
 from stages.warm_start import FieldStart, go_on_from
 
 REPORT_SECONDS = 0.5
@@ -95,13 +96,33 @@ def train_tile(job: TileTraining, source: PixelSource, scratch: Path, report: Re
     rows = training_rows(job.frames, job.settings.training)
     if not len(rows):
         raise InputError(f"tile {job.tile_id}: none of its {len(job.frames)} frames is for training; ingest more")
-    run = card_training.CardRun(job, scratch, source, rows) if card_training.suits(job) else Run(job, scratch)
+    depths = known_depths(job, source, rows, scratch, report)
+    if card_training.suits(job):
+        run = card_training.CardRun(job, scratch, source, rows, depths=depths)
+    else:
+        run = Run(job, scratch, depths)
     if run.step < job.settings.training.steps:
         report(Progress("training", run.step, job.settings.training.steps))
         with _steps(job, run, source, rows) as advance, _Log(job, scratch, report) as log:
             _train(job, run, advance, log)
     checkpoint.save_field(scratch / "field", run.field)
     return TrainingResult(scratch / "field", run.metrics)
+
+
+def known_depths(
+    job: TileTraining, source: PixelSource, rows: NDArray[np.int64], scratch: Path, report: Report = silent
+) -> KnownDepths | None:
+    """What neighbouring images tell of the depths in the images of these rows; None if that is not wanted.
+
+    It is kept in `scratch`, so that a training that goes on need not look again.
+    """
+    width_px = job.settings.training.stereo.width_px
+    if not job.settings.training.stereo.weight:
+        return None
+    scratch.mkdir(parents=True, exist_ok=True)
+    images = Images(job.frames, rows, source)
+    maps = depth_maps(images, width_px, scratch / f"stereo-{job.recipe.digest}.npy", report)
+    return KnownDepths(maps, job.frames.select(rows), width_px, job.device)
 
 
 @contextmanager
@@ -180,8 +201,9 @@ def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.i
 class Run:
     """A field in training: its parameters, its optimiser, and their checkpoint."""
 
-    def __init__(self, job: TileTraining, scratch: Path) -> None:
+    def __init__(self, job: TileTraining, scratch: Path, depths: KnownDepths | None = None) -> None:
         self.step, self.metrics = 0, {}
+        self._depths = depths
         self._job, self._settings = job, job.settings.training
         self._file = scratch / "training.safetensors"
         self._videos, self._images = video_numbers(job.frames), image_numbers(job.frames, self._settings)
@@ -249,6 +271,10 @@ class Run:
             middles_m = (rendering.edges_m[:, 1:] + rendering.edges_m[:, :-1]) / 2
             ground = losses.ground_loss(rendering.field.weights, middles_m, starts_m)
             parts["ground"] = self._settings.ground.weight * ground
+        if self._depths is not None:
+            stereo, depth_m = self._settings.stereo, self._depths.along(rays)
+            loss = losses.stereo_loss(rendering.field.weights, rendering.edges_m, depth_m, stereo.tolerance)
+            parts["stereo"] = stereo.weight * loss
         torch.stack(list(parts.values())).sum().backward()
         self._optimiser.step()
         self._optimiser.zero_grad()

@@ -9,7 +9,7 @@ Edges = Float[Tensor, "rays edges"]
 Weights = Float[Tensor, "rays bins"]
 
 
-GROUND_SLACK = 0.1  # see `ground_loss`
+SLACK = 0.1  # of a ray's weight: a ray that something wrong is known of pulls ten times as hard as a right one at most
 
 
 def feature_loss(rendered: Tensor, target: Tensor) -> Tensor:
@@ -34,12 +34,26 @@ def sky_loss(
 def ground_loss(
     weights: Weights, middles_m: Float[Tensor, "rays bins"], start_m: Float[Tensor, " rays"]
 ) -> Float[Tensor, ""]:
-    """Negative logarithm of the weight beyond `start_m`, mean over rays; rays that start at 0 cost nothing.
-
-    A tenth is added to the weight, so that a pixel with a wrong label pulls ten times as hard as a right one at most.
-    """
+    """Negative logarithm of the weight beyond `start_m`, mean over rays; rays that start at 0 cost nothing."""
     beyond = (weights * (middles_m > start_m[:, None])).sum(-1)
-    return torch.where(start_m > 0, -((beyond + GROUND_SLACK) / (1 + GROUND_SLACK)).log(), 0).mean()
+    return _missing(beyond, start_m > 0)
+
+
+def stereo_loss(
+    weights: Weights, edges_m: Edges, depth_m: Float[Tensor, " rays"], tolerance: float
+) -> Float[Tensor, ""]:
+    """Negative logarithm of the weight within a share of `depth_m`, mean over rays; rays of depth 0 cost nothing.
+
+    Where bins are wider than that, the bin that holds the depth and its neighbour count.
+    """
+    middles_m, lengths_m = (edges_m[:, 1:] + edges_m[:, :-1]) / 2, edges_m.diff(dim=-1)
+    is_near = (middles_m - depth_m[:, None]).abs() <= torch.maximum(tolerance * depth_m[:, None], lengths_m)
+    return _missing((weights * is_near).sum(-1), depth_m > 0)
+
+
+def _missing(weight: Float[Tensor, " rays"], is_known: Bool[Tensor, " rays"]) -> Float[Tensor, ""]:
+    """Negative logarithm of weights that should be 1, mean over all rays; what is not known costs nothing."""
+    return torch.where(is_known, -((weight + SLACK) / (1 + SLACK)).log(), 0).mean()
 
 
 def distortion_loss(edges: Edges, weights: Weights) -> Tensor:

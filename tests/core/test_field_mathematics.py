@@ -125,6 +125,16 @@ def test_the_ground_loss_is_the_missing_weight_beyond_the_start_of_the_ground():
     assert loss.item() == pytest.approx(-math.log((0.5 + 0.1) / 1.1) / 2)  # the second ray knows of no ground
 
 
+def test_the_stereo_loss_is_the_missing_weight_near_the_known_depth():
+    weights = torch.tensor([[0.25, 0.5, 0.125], [0.25, 0.5, 0.125], [0.0, 0.0, 0.0]])
+    edges_m = torch.tensor([[0.0, 1.0, 2.0, 3.0], [28.0, 30.0, 32.0, 36.0], [0.0, 1.0, 2.0, 3.0]])
+    loss = losses.stereo_loss(weights, edges_m, torch.tensor([1.4, 32.5, 0.0]), 0.05)
+    one = weights[0, :2].sum()  # the bin that holds 1.4 m, and the one before it: neither middle is a bin away
+    two = weights[1, 1:].sum()  # likewise
+    expected = -torch.log((torch.stack([one, two]) + 0.1) / 1.1).sum() / 3  # of the third nothing is known
+    torch.testing.assert_close(loss, expected)
+
+
 def test_fading_keeps_values_and_scales_gradients_by_the_squared_distance():
     density = torch.ones(1, 3, requires_grad=True)
     edges_m = torch.tensor([[0.0, 2.0, 8.0, 40.0]])  # middles at 1, 5 and 24 m

@@ -1,0 +1,197 @@
+"""How far the surfaces of an image are, told from images of the same things taken nearby: a plane sweep.
+
+Around a pixel a small patch of surface is put at one distance after the other (Collins, A space-sweep approach to true
+multi-image matching, 1996). Where it is right, the other images show the patch as the first one does, whatever the
+exposure: the correlation of their grey values is near 1. Nothing is learned, and poses must be known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from jaxtyping import Float, UInt8
+from numba import prange
+from numpy.typing import NDArray
+
+from presight_core.cameras import Camera, pixel_centres
+
+CELL_PX = 4  # a depth is found for every fourth pixel of every fourth row
+PATCH_PX = 2 * np.mgrid[-2:3, -2:3][::-1].reshape(2, -1).T  # (25, 2) offsets: every second pixel of nine by nine
+NEAREST_M, FARTHEST_M = 2.5, 60.0
+DEPTH_COUNT = 128  # even in 1 / depth; with 96 one depth in twenty fewer is found, in 20 % less time
+MIN_CONTRAST = 2.0  # grey levels, standard deviation in a patch: flatter ones match anything
+REACH_M = np.float32(0.5)  # nearer to a source's image plane than this nothing is looked for
+MAX_TILT = 2.0  # a patch is at most so many times nearer or farther at its rim than at its centre
+
+
+@dataclass(frozen=True)
+class View:
+    """A grey image, best a little smoothed, and its camera, which counts in the image's own pixels."""
+
+    grey: UInt8[NDArray, "height width"]
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Depths:
+    """Along the optical axis, metres, at the middle of every cell, and how well other images agree (-1..1)."""
+
+    depth_m: Float[NDArray, "rows columns"]
+    correlation: Float[NDArray, "rows columns"]  # mean of the two best; -1 where nothing can be told
+
+
+def sweep(reference: View, normals: Float[NDArray, "rows columns 3"], sources: Sequence[View]) -> Depths:
+    """Depths in the reference image that explain the sources (one at least, all of one size) best.
+
+    `normals`, in the reference camera's axes and of any length, say how the surface lies in each cell; where they are
+    0 nothing is looked for.
+    """
+    camera = reference.camera
+    pixels = pixel_centres(camera.width_px, camera.height_px, CELL_PX)
+    turns, shifts = _motions(camera, [source.camera for source in sources])
+    patches, has_contrast = _patches(reference.grey, pixels)
+    places, correlation = np.zeros(len(pixels), np.float32), np.full(len(pixels), -1, np.float32)
+    nearness = np.linspace(1 / NEAREST_M, 1 / FARTHEST_M, DEPTH_COUNT)
+    _best_places(
+        np.flatnonzero(has_contrast & normals.reshape(-1, 3).any(-1)),
+        patches,
+        _patch_rays(camera, pixels, normals.reshape(-1, 3)),
+        np.stack([source.grey.ravel() for source in sources]),
+        np.array(sources[0].grey.shape[::-1], np.int32),
+        turns,
+        shifts,
+        (1 / nearness).astype(np.float32),
+        places,
+        correlation,
+        numba.get_num_threads(),
+    )
+    depth_m = 1 / np.interp(places, np.arange(DEPTH_COUNT), nearness)
+    return Depths(depth_m.astype(np.float32).reshape(normals.shape[:2]), correlation.reshape(normals.shape[:2]))
+
+
+def grid_shape(width_px: int, height_px: int) -> tuple[int, int]:
+    """Rows and columns of the cells of an image."""
+    rows, columns = (len(range(CELL_PX // 2, size, CELL_PX)) for size in (height_px, width_px))
+    return rows, columns
+
+
+def _motions(camera: Camera, others: list[Camera]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What takes points (3,) of the camera to homogeneous pixels of others: turns (K, 3, 3) and shifts (K, 3)."""
+    world_from_camera = np.stack([other.world_from_camera for other in others])
+    pixel_from_world = np.stack([other.intrinsics for other in others]) @ world_from_camera[:, :3, :3].swapaxes(1, 2)
+    offsets = camera.world_from_camera[:3, 3] - world_from_camera[:, :3, 3]
+    turns = pixel_from_world @ camera.world_from_camera[:3, :3]
+    return turns.astype(np.float32), np.einsum("kij,kj->ki", pixel_from_world, offsets).astype(np.float32)
+
+
+def _patches(
+    grey: UInt8[NDArray, "height width"], pixels: Float[NDArray, "cells 2"]
+) -> tuple[Float[NDArray, "cells samples"], NDArray[np.bool_]]:
+    """Grey values around pixels, of mean 0 and length 1, and where they are inside the image and differ."""
+    height, width = grey.shape
+    columns, rows = (pixels[:, None] + PATCH_PX).astype(np.int64).transpose(2, 0, 1)
+    inside = (columns.min(1) >= 0) & (rows.min(1) >= 0) & (columns.max(1) < width) & (rows.max(1) < height)
+    values = grey[rows.clip(0, height - 1), columns.clip(0, width - 1)].astype(np.float32)
+    values -= values.mean(1, keepdims=True)
+    length = np.linalg.norm(values, axis=1)
+    return values / np.maximum(length, 1)[:, None], inside & (length > MIN_CONTRAST * np.sqrt(len(PATCH_PX)))
+
+
+def _patch_rays(
+    camera: Camera, pixels: Float[NDArray, "cells 2"], normals: Float[NDArray, "cells 3"]
+) -> Float[NDArray, "cells samples 3"]:
+    """Points of a patch whose centre is at depth 1, in the camera's axes: all on a plane with the normal.
+
+    At another depth the patch has the same form, only larger.
+    """
+    homogeneous = np.concatenate([pixels[:, None] + PATCH_PX, np.ones((len(pixels), len(PATCH_PX), 1))], -1)
+    rays = homogeneous @ np.linalg.inv(camera.intrinsics).T
+    away = np.einsum("nsi,ni->ns", rays, normals)
+    middle = away[:, len(PATCH_PX) // 2, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tilt = np.nan_to_num(middle / away, nan=1.0)
+    tilt[(tilt <= 0).any(1)] = 1  # a plane that the camera is in: take the patch for one that faces it
+    return (rays * tilt.clip(1 / MAX_TILT, MAX_TILT)[..., None]).astype(np.float32)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _best_places(cells, patches, rays, sources, size_px, turns, shifts, depths_m, places, correlation, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
+    """Fill, for the cells of the list, the index (with a fraction) of the best depth, and the correlation there."""
+    for worker in prange(worker_count):
+        seen = np.empty((len(turns), 3, patches.shape[1]), np.float32)
+        at = np.empty(patches.shape[1], np.uint32)
+        scores = np.empty(len(depths_m), np.float32)
+        for place in range(worker, len(cells), worker_count):
+            cell = cells[place]
+            _turn(rays, cell, turns, seen)
+            for depth in range(len(depths_m)):
+                best, second = np.float32(-1), np.float32(-1)
+                for source in range(len(turns)):
+                    if _project(seen, shifts, source, depths_m[depth], size_px, at):
+                        found = _correlation(patches, cell, sources, source, at)
+                        if found > best:
+                            best, second = found, best
+                        elif found > second:
+                            second = found
+                scores[depth] = (best + second) / np.float32(2)  # what hides the patch from others does not count
+            chosen = np.argmax(scores)
+            correlation[cell] = scores[chosen]
+            places[cell] = chosen + _fraction(scores, chosen)
+
+
+# The functions below get whole arrays and indices: slices of arrays would cost as much as the work on them.
+
+
+@numba.njit(fastmath=True, inline="always")
+def _turn(rays, cell, turns, seen):
+    """Fill seen (K, 3, S): the patch in each source's homogeneous pixels, shifts aside."""
+    for source in range(len(turns)):
+        for axis in range(3):
+            x, y, z = turns[source, axis, 0], turns[source, axis, 1], turns[source, axis, 2]
+            for i in range(rays.shape[1]):
+                seen[source, axis, i] = x * rays[cell, i, 0] + y * rays[cell, i, 1] + z * rays[cell, i, 2]
+
+
+@numba.njit(fastmath=True, inline="always")
+def _project(seen, shifts, source, depth_m, size_px, at):
+    """Fill at (S,) with the patch's pixels in a source, counted row by row; False where one is outside."""
+    width, height = size_px
+    shift_x, shift_y, shift_z = shifts[source, 0], shifts[source, 1], shifts[source, 2]
+    middle = seen.shape[2] // 2
+    away_m = depth_m * seen[source, 2, middle] + shift_z
+    x, y = depth_m * seen[source, 0, middle] + shift_x, depth_m * seen[source, 1, middle] + shift_y
+    if away_m < REACH_M or x < 0 or y < 0 or x > width * away_m or y > height * away_m:
+        return False  # most are, and this costs less than the whole patch
+    low_x, high_x, low_y, high_y = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    for i in range(seen.shape[2]):
+        scale = np.float32(1) / max(depth_m * seen[source, 2, i] + shift_z, REACH_M)
+        x = (depth_m * seen[source, 0, i] + shift_x) * scale
+        y = (depth_m * seen[source, 1, i] + shift_y) * scale
+        low_x, high_x, low_y, high_y = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
+        at[i] = np.uint32(np.int32(y) * width + np.int32(x))
+    return low_x >= 0 and low_y >= 0 and high_x < width and high_y < height
+
+
+@numba.njit(fastmath=True, inline="always")
+def _correlation(patches, cell, sources, source, at):
+    """Correlation of a patch of mean 0 and length 1 with the grey values at pixels; 0 where these hardly differ."""
+    total, squares, common = np.float32(0), np.float32(0), np.float32(0)
+    count = np.float32(len(at))
+    for i in range(len(at)):
+        value = np.float32(sources[source, at[i]])
+        total += value
+        squares += value * value
+        common += value * patches[cell, i]
+    spread = squares - total * total / count
+    return common / np.sqrt(spread) if spread > count else np.float32(0)
+
+
+@numba.njit(fastmath=True, inline="always")
+def _fraction(scores, best):
+    """How far the top of a parabola through the best score and its neighbours is from the best, -0.5..0.5."""
+    if best == 0 or best == len(scores) - 1:
+        return np.float32(0)
+    before, after = scores[best - 1], scores[best + 1]
+    bend = before - 2 * scores[best] + after
+    return (before - after) / (2 * bend) if bend < 0 else np.float32(0)

@@ -1,0 +1,160 @@
+"""How far the surfaces in a tile's images are, from neighbouring images alone, before anything is trained.
+
+Each image is compared with the six of its drive that show most of the same (`plane_sweep`). Depths stay where at least
+two images, looked at for themselves, say the same of the place: nine in ten of those are right
+(docs/benchmarks/field.md). The field is then told to end its rays there.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16
+from numpy.typing import NDArray
+from torch import Tensor
+
+from presight_core import classes
+from presight_core.cameras import Camera, pixel_centres
+from presight_core.drives import FrameTable
+from presight_core.field.rays import Rays
+from presight_core.images import grey_level, resized
+from presight_core.pixels import PixelSource, cell_of
+from presight_core.plane_sweep import CELL_PX, View, grid_shape, sweep
+from presight_core.progress import Progress, Report, silent
+from stages.neighbours import Neighbours
+
+LEVEL = classes.lookup(("road", "sidewalk", "terrain"))  # patches of these lie flat, all others face the camera
+NOWHERE = classes.lookup((*classes.DYNAMIC, "sky"))  # no ray of training wants to know where these are
+SOURCES = 6  # images that an image is compared with
+JUDGES = 20  # images that are asked whether they found the same
+AGREEING = 2  # of the judges must have
+MIN_CORRELATION = 0.6
+MAX_DIFFERENCE = 0.04  # between depths that agree, a share
+KEPT_VIEWS = 512  # small images in memory, 50 MB: a drive's neighbours follow each other in time
+
+DepthMaps = Float16[NDArray, "images rows columns"]  # metres along the optical axis; 0 where nothing is known
+
+
+@dataclass(frozen=True)
+class Images:
+    """Some rows of a frame table, and what gives their pixels."""
+
+    frames: FrameTable  # the whole table, whose rows `source` counts
+    rows: NDArray[np.int64]
+    source: PixelSource
+
+
+def depth_maps(images: Images, width_px: int, file: Path, report: Report = silent) -> DepthMaps:
+    """The depths that are known of each image. They are kept in `file`, and taken from there the next time.
+
+    Images are compared at the given width, or at their own if that is less. Raises InputError if an image cannot be
+    read.
+    """
+    if not file.exists():
+        comparison = _Comparison(images, small_cameras(images.frames.select(images.rows), width_px))
+        guesses, agreed = (_new_array(file.with_suffix(suffix), comparison.shape) for suffix in (".guesses", ".part"))
+        for done, image in enumerate(comparison.in_order, 1):
+            comparison.guess(image, guesses)
+            report(Progress("stereo", done, len(images.rows)))
+        for image in comparison.in_order:
+            comparison.judge(image, guesses, agreed)
+        agreed.flush()
+        file.with_suffix(".part").replace(file)
+        file.with_suffix(".guesses").unlink()
+    return np.load(file, mmap_mode="c")
+
+
+class KnownDepths:
+    """Where rays of trained images end, as far as that is known."""
+
+    def __init__(self, maps: DepthMaps, frames: FrameTable, width_px: int, device: str) -> None:
+        """Depth maps of `depth_maps`, whose frames are numbered as the field's images."""
+        cell_from_pixel = np.diag([1 / CELL_PX, 1 / CELL_PX, 1])
+        cell_from_world = [
+            cell_from_pixel @ camera.intrinsics @ camera.world_from_camera[:3, :3].T
+            for camera in small_cameras(frames, width_px)
+        ]
+        self._maps = torch.from_numpy(maps).to(device)
+        self._cell_from_world = torch.from_numpy(np.array(cell_from_world, np.float32)).to(device)
+
+    def along(self, rays: Rays) -> Float[Tensor, " rays"]:
+        """Metres along each ray; 0 where nothing is known."""
+        assert rays.images is not None, "rays of training come from images"
+        x, y, along_axis = torch.einsum("nij,nj->in", self._cell_from_world[rays.images], rays.directions)
+        _, row_count, column_count = self._maps.shape
+        row, column = (y / along_axis).long(), (x / along_axis).long()
+        depth_m = self._maps[rays.images, row.clamp(0, row_count - 1), column.clamp(0, column_count - 1)]
+        return depth_m / along_axis
+
+
+class _Comparison:
+    """Images and their neighbours."""
+
+    def __init__(self, images: Images, cameras: list[Camera]) -> None:
+        self._images, self._cameras = images, cameras
+        chosen = images.frames.select(images.rows)
+        self._drive_id = chosen.drive_id
+        self._neighbours = Neighbours(chosen)
+        self._view = lru_cache(KEPT_VIEWS)(self._load)
+        self.in_order = np.lexsort([chosen.timestamp_us, chosen.drive_id]).tolist()
+        self.shape = len(cameras), *np.max([grid_shape(each.width_px, each.height_px) for each in cameras], 0).tolist()
+
+    def guess(self, image: int, guesses: DepthMaps) -> None:
+        """Write the depths at which other images of the drive, so in the same light, look best."""
+        others = self._neighbours.of(image)
+        others = others[self._drive_id[others] == self._drive_id[image]][:SOURCES].tolist()
+        if others:
+            found = sweep(*self._view(image), [self._view(other)[0] for other in others])
+            _put(guesses[image], np.where(found.correlation > MIN_CORRELATION, found.depth_m, 0))
+
+    def judge(self, image: int, guesses: DepthMaps, agreed: DepthMaps) -> None:
+        """Write the guesses with which those of other images, of any drive, agree."""
+        camera = self._cameras[image]
+        rows, columns = grid_shape(camera.width_px, camera.height_px)
+        depth_m = guesses[image, :rows, :columns].astype(np.float64).ravel()
+        origin, directions = camera.rays(pixel_centres(camera.width_px, camera.height_px, CELL_PX))
+        points = origin + (depth_m / (directions @ camera.world_from_camera[:3, 2]))[:, None] * directions
+        votes = np.zeros(len(points), np.int64)
+        for judge in self._neighbours.of(image)[:JUDGES].tolist():
+            votes += _agrees(self._cameras[judge], guesses[judge], points)
+        _put(agreed[image], np.where(votes >= AGREEING, depth_m, 0).reshape(rows, columns))
+
+    def _load(self, image: int) -> tuple[View, Float[NDArray, "rows columns 3"]]:
+        """A small grey image, and how the surface lies in each cell, in the camera's axes."""
+        camera, pixels = self._cameras[image], self._images.source.load(int(self._images.rows[image]))
+        size_px = camera.width_px, camera.height_px
+        labels = pixels.labels[cell_of(pixel_centres(*size_px, CELL_PX), size_px, pixels.labels.shape)]
+        normals = np.where(LEVEL[labels][:, None], camera.world_from_camera[2, :3], (0.0, 0.0, 1.0))
+        normals[NOWHERE[labels]] = 0
+        return View(grey_level(resized(pixels.rgb, *size_px)), camera), normals.reshape(*grid_shape(*size_px), 3)
+
+
+def small_cameras(frames: FrameTable, width_px: int) -> list[Camera]:
+    """The cameras of the frames' images as they are compared."""
+    cameras = [frames.camera_of(row) for row in range(len(frames))]
+    scales = [min(1.0, width_px / camera.width_px) for camera in cameras]
+    return [
+        camera.scaled(round(camera.width_px * scale), max(1, round(camera.height_px * scale)))
+        for camera, scale in zip(cameras, scales, strict=True)
+    ]
+
+
+def _agrees(camera: Camera, guess: Float16[NDArray, "rows columns"], points_world: NDArray) -> NDArray[np.bool_]:
+    """Which points (N, 3) in the world a camera's image puts where they are."""
+    pixels, depth_m = camera.project(points_world)
+    inside = np.flatnonzero(np.all((pixels >= 0) & (pixels < [camera.width_px, camera.height_px]), axis=-1))
+    columns, rows = np.minimum(pixels[inside] // CELL_PX, np.array(guess.shape)[::-1] - 1).astype(np.int64).T
+    agrees = np.zeros(len(points_world), np.bool_)
+    agrees[inside] = np.abs(guess[rows, columns] / depth_m[inside] - 1) < MAX_DIFFERENCE
+    return agrees
+
+
+def _put(grid: DepthMaps, depths_m: NDArray) -> None:
+    """Fill the corner of a grid, which may be of a larger image."""
+    grid[: depths_m.shape[0], : depths_m.shape[1]] = depths_m
+
+
+def _new_array(file: Path, shape: tuple[int, ...]) -> np.memmap:
+    return np.lib.format.open_memmap(file, "w+", np.float16, shape)

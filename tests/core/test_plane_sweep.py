@@ -1,0 +1,90 @@
+"""Depths of planes with a pattern, from cameras side by side."""
+
+import numpy as np
+import pytest
+
+from presight_core.cameras import Camera
+from presight_core.plane_sweep import CELL_PX, View, grid_shape, sweep
+from tests.patterned_scene import FOCAL, GROUND, HEIGHT, WIDTH, Plane, camera_at, depth_m, picture, wall
+
+REFERENCE = camera_at(0, 0)
+BESIDE = [camera_at(0, y_m) for y_m in (-1.0, -0.5, 0.5, 1.0)]
+SHAPE = grid_shape(WIDTH, HEIGHT)
+FACING = np.broadcast_to((0.0, 0.0, 1.0), (*SHAPE, 3))
+INNER = np.s_[2:-2, 6:-6]  # cells that most of the cameras see
+
+
+def view(camera: Camera, *planes: Plane) -> View:
+    return View(picture(camera, *planes), camera)
+
+
+def views(cameras: list[Camera], *planes: Plane) -> list[View]:
+    return [view(camera, *planes) for camera in cameras]
+
+
+def true_depth_m(*planes: Plane) -> np.ndarray:
+    return depth_m(REFERENCE, *planes)[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
+
+
+@pytest.mark.parametrize("distance_m", [4.0, 9.0, 20.0])
+def test_a_wall_is_found_where_it_stands(distance_m):
+    found = sweep(view(REFERENCE, wall(distance_m)), FACING, views(BESIDE, wall(distance_m)))
+    disparity_px = FOCAL * 1.0 / distance_m  # between the cameras that stand farthest beside
+    assert np.abs(found.depth_m[INNER] / distance_m - 1).max() < 0.75 / disparity_px
+    assert found.correlation[INNER].min() > 0.8
+
+
+def test_a_patch_of_the_ground_lies_level():
+    ahead = [camera_at(x_m, y_m) for x_m, y_m in ((1.0, -0.7), (1.0, 0.7), (2.0, 0.0), (-1.0, 0.5))]
+    sources = views(ahead, GROUND)
+    truth = true_depth_m(GROUND)
+    rows = (truth[:, 0] > 7) & (truth[:, 0] < 11)  # nearer other cameras do not see it, farther pixels are coarse
+    level = np.broadcast_to((0.0, -1.0, 0.0), FACING.shape)  # up, in a level camera's axes
+    errors = [
+        np.abs(sweep(view(REFERENCE, GROUND), normals, sources).depth_m / truth - 1)[rows, 6:-6]
+        for normals in (level, FACING)
+    ]
+    assert (errors[0] < 0.03).mean() > 0.8
+    assert (errors[1] < 0.03).mean() < 0.5
+
+
+def test_the_exposure_of_other_images_does_not_matter():
+    sources = views(BESIDE, wall(9.0))
+    darker = [View((source.grey * 0.4 + 30).astype(np.uint8), source.camera) for source in sources]
+    plain, found = (sweep(view(REFERENCE, wall(9.0)), FACING, each) for each in (sources, darker))
+    np.testing.assert_allclose(found.depth_m[INNER], plain.depth_m[INNER], rtol=0.02)
+
+
+def test_two_images_that_see_the_place_are_enough():
+    random = np.random.default_rng(1)
+    hidden = [View(random.integers(0, 255, (HEIGHT, WIDTH), np.uint8), camera) for camera in BESIDE[:2]]
+    found = sweep(view(REFERENCE, wall(9.0)), FACING, [*hidden, *views(BESIDE[2:], wall(9.0))])
+    inner = np.s_[2:-2, 2:-8]  # both remaining cameras stand to the left
+    assert (np.abs(found.depth_m[inner] / 9.0 - 1) < 0.06).mean() > 0.95
+
+
+def test_nothing_is_told_where_the_image_is_plain_or_nothing_is_looked_for():
+    grey = picture(REFERENCE, wall(9.0))
+    grey[:, : WIDTH // 2] = 90
+    normals = FACING.copy()
+    normals[: SHAPE[0] // 2] = 0
+    found = sweep(View(grey, REFERENCE), normals, views(BESIDE, wall(9.0)))
+    rows, columns = SHAPE
+    assert (found.correlation[: rows // 2] == -1).all()
+    assert (found.correlation[:, : columns // 2 - 1] == -1).all()
+    assert found.correlation[rows // 2 : -2, columns // 2 + 2 : -6].min() > 0.8
+
+
+def test_nothing_is_told_where_no_other_image_looks():
+    behind = camera_at(0, 0.5, np.pi)
+    found = sweep(view(REFERENCE, wall(9.0)), FACING, [View(picture(REFERENCE, wall(9.0)), behind)])
+    assert (found.correlation <= 0).all()
+
+
+def test_the_result_does_not_depend_on_the_number_of_threads(monkeypatch):
+    given = view(REFERENCE, wall(9.0)), FACING, views(BESIDE, wall(9.0))
+    results = []
+    for count in (1, 3):
+        monkeypatch.setattr("numba.get_num_threads", lambda count=count: count)
+        results.append(sweep(*given))
+    np.testing.assert_array_equal(results[0].depth_m, results[1].depth_m)

@@ -1,0 +1,191 @@
+"""Depths of images from their neighbours, on a street with a wall across its end."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from presight_core import classes
+from presight_core.drives import FrameTable
+from presight_core.errors import InputError
+from presight_core.field.rays import Rays
+from presight_core.pixels import FramePixels
+from presight_core.plane_sweep import CELL_PX
+from presight_core.progress import Progress
+from stages import stereo
+from stages.card_training import CardRun
+from stages.feeding import Feed
+from stages.ray_pool import RayPool
+from stages.stereo import Images, KnownDepths, depth_maps
+from stages.training import Run, known_depths, train_tile, training_rows
+from tests.patterned_scene import GROUND, HEIGHT, INTRINSICS, WIDTH, camera_at, depth_m, picture, wall
+from tests.stages.small_training import street, tiny_job
+
+PLANES = GROUND, wall(14.0)
+PLACES = [(0.5 * i, y_m) for i in range(5) for y_m in (-0.8, 0.0, 0.8)]
+CAR = classes.CITYSCAPES.index("car")
+BUILDING = classes.CITYSCAPES.index("building")
+
+
+class Street:
+    """Its pictures. The wall's left part is a car, so far as labels can tell."""
+
+    def __init__(self, frames: FrameTable) -> None:
+        self._frames = frames
+
+    def load(self, row: int) -> FramePixels:
+        camera = self._frames.camera_of(row)
+        grey, is_wall = picture(camera, *PLANES), depth_m(camera, *PLANES) < depth_m(camera, GROUND) - 0.01
+        labels = np.where(is_wall, BUILDING, 0).astype(np.uint8)
+        labels[:, : WIDTH // 4] = np.where(is_wall[:, : WIDTH // 4], CAR, 0)
+        return FramePixels(np.stack([grey] * 3, -1), labels, np.zeros((4, 6, 3), np.uint8))
+
+
+def drives(count: int = 1) -> FrameTable:
+    """Fifteen pictures of the street."""
+    frames = street(len(PLACES), count)
+    poses = np.stack([camera_at(*place).world_from_camera for place in PLACES])
+    size = {"width_px": np.full(len(PLACES), WIDTH, np.int32), "height_px": np.full(len(PLACES), HEIGHT, np.int32)}
+    intrinsics = np.tile(INTRINSICS, (len(PLACES), 1, 1))
+    return replace(frames, world_from_camera=poses, intrinsics=intrinsics, **size)
+
+
+def images_of(frames: FrameTable) -> Images:
+    return Images(frames, np.arange(len(frames)), Street(frames))
+
+
+def truth_of(frames: FrameTable, row: int) -> np.ndarray:
+    return depth_m(frames.camera_of(row), *PLANES)[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
+
+
+def labels_of(frames: FrameTable, row: int) -> np.ndarray:
+    return Street(frames).load(row).labels[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
+
+
+def test_depths_are_right_and_missing_only_where_they_cannot_be_told(tmp_path):
+    frames = drives()
+    maps = depth_maps(images_of(frames), WIDTH, tmp_path / "depths.npy").astype(np.float64)
+    truth = np.stack([truth_of(frames, row) for row in range(len(frames))])
+    known = maps > 0
+    assert known.mean() > 0.3
+    assert (np.abs(maps / truth - 1)[known] < 0.05).mean() > 0.95
+    assert (np.abs(maps / truth - 1)[known & (truth > 11)] < 0.05).mean() > 0.9
+
+
+def test_of_moving_things_nothing_is_said(tmp_path):
+    frames = drives()
+    maps = depth_maps(images_of(frames), WIDTH, tmp_path / "depths.npy")
+    labels = np.stack([labels_of(frames, row) for row in range(len(frames))])
+    assert (maps[labels == CAR] == 0).all()
+    assert (maps[labels == BUILDING] > 0).any()
+
+
+def test_an_image_that_shows_something_else_has_no_depths(tmp_path, monkeypatch):
+    frames, strange = drives(), 7
+    honest = Street.load
+
+    def load(self: Street, row: int) -> FramePixels:
+        pixels = honest(self, row)
+        noise = np.random.default_rng(row).integers(0, 255, pixels.rgb.shape, np.uint8)
+        return replace(pixels, rgb=noise) if row == strange else pixels
+
+    monkeypatch.setattr(Street, "load", load)
+    maps = depth_maps(images_of(frames), WIDTH, tmp_path / "depths.npy")
+    shares = (maps > 0).mean((1, 2))
+    assert shares[strange] < 0.02
+    assert np.delete(shares, strange).mean() > 0.25
+
+
+def test_drives_are_compared_within_themselves_and_judged_by_all(tmp_path):
+    one, three = drives(1), drives(3)  # five pictures a drive
+    shares = [
+        (depth_maps(images_of(each), WIDTH, tmp_path / f"{each.drive_id[-1]}.npy") > 0).mean() for each in (one, three)
+    ]
+    assert shares[1] > shares[0] / 3
+    lone = replace(one, drive_id=np.array([f"drive{i}" for i in range(len(one))]))
+    assert not depth_maps(images_of(lone), WIDTH, tmp_path / "lone.npy").any()
+
+
+def test_maps_are_made_once(tmp_path):
+    images, seen = images_of(drives()), []
+    first = depth_maps(images, WIDTH, tmp_path / "depths.npy", seen.append)
+    assert seen[-1] == Progress("stereo", len(PLACES), len(PLACES))
+    assert [file.name for file in tmp_path.iterdir()] == ["depths.npy"]
+    again = depth_maps(images, WIDTH, tmp_path / "depths.npy", seen.append)
+    assert len(seen) == len(PLACES)
+    np.testing.assert_array_equal(first, again)
+
+
+def test_an_unreadable_image_stops_it_and_leaves_nothing_half_done(tmp_path, monkeypatch):
+    def load(self: Street, row: int) -> FramePixels:
+        raise InputError("3.jpg: cannot be read; restore the file")
+
+    monkeypatch.setattr(Street, "load", load)
+    with pytest.raises(InputError, match=r"3\.jpg"):
+        depth_maps(images_of(drives()), WIDTH, tmp_path / "depths.npy")
+    assert not (tmp_path / "depths.npy").exists()
+
+
+def test_images_of_other_sizes_share_one_array(tmp_path):
+    frames = drives()
+    heights = frames.height_px.copy()
+    heights[::3] = HEIGHT // 2
+
+    class Cropped(Street):
+        def load(self, row: int) -> FramePixels:
+            pixels, height = super().load(row), heights[row]
+            return replace(pixels, rgb=pixels.rgb[:height], labels=pixels.labels[:height])
+
+    cropped = replace(frames, height_px=heights)
+    maps = depth_maps(Images(cropped, np.arange(len(frames)), Cropped(frames)), WIDTH, tmp_path / "depths.npy")
+    assert maps.shape[1:] == (HEIGHT // CELL_PX, WIDTH // CELL_PX)
+    assert not maps[::3, HEIGHT // CELL_PX // 2 :].any()
+    assert maps[1::3].any()
+
+
+def test_rays_of_images_end_at_their_known_depths(tmp_path):
+    frames = drives()
+    maps = depth_maps(images_of(frames), WIDTH, tmp_path / "depths.npy")
+    pool = RayPool(frames, Street(frames), np.arange(len(frames)))
+    random = np.random.default_rng(0)
+    images, pixels = random.integers(len(frames), size=500), random.integers((WIDTH, HEIGHT), size=(500, 2))
+    batch = pool.at(images, pixels)
+    values = (torch.from_numpy(value.astype(np.float32)) for value in (batch.origins_world, batch.directions_world))
+    found_m = KnownDepths(maps, frames, WIDTH, "cpu").along(Rays(*values, None, torch.from_numpy(images))).numpy()
+    cells = images, pixels[:, 1] // CELL_PX, pixels[:, 0] // CELL_PX
+    np.testing.assert_array_equal(found_m > 0, maps[cells] > 0)
+    true_m = np.stack([depth_m(frames.camera_of(row), *PLANES) for row in range(len(frames))])
+    met = batch.origins_world + found_m[:, None] * batch.directions_world
+    forward_m = (met - batch.origins_world)[:, 0]  # all cameras look along x
+    error = np.abs(forward_m / true_m[images, pixels[:, 1], pixels[:, 0]] - 1)[found_m > 0]
+    assert (error < 0.1).mean() > 0.9  # a cell holds pixels of other depths too
+
+
+def test_both_ways_to_train_heed_known_depths(tmp_path):
+    frames = drives()
+    job = tiny_job("training.stereo.weight=0.1", "training.stereo.width_px=96", frames=frames)
+    source, rows = Street(frames), training_rows(frames, job.settings.training)
+    depths = known_depths(job, source, rows, tmp_path)
+    with Feed(job, source, rows) as feed:
+        found = Run(job, tmp_path, depths).train(0, feed.batch(0))["stereo"]
+    assert 0 < found < 0.1 * np.log(11)  # a tenth of the rays' whole weight is the worst
+    on_card = CardRun(job, tmp_path, source, rows, depths=depths).advance(0)["stereo"]
+    assert 0 < on_card < 0.1 * np.log(11)
+
+
+def test_a_tile_trains_with_known_depths_and_goes_on_without_looking_again(tmp_path, monkeypatch):
+    frames = drives()
+    job = tiny_job("training.stereo.weight=0.1", "training.stereo.width_px=96", frames=frames)
+    seen: list[Progress] = []
+    train_tile(job, Street(frames), tmp_path, seen.append)
+    assert seen[0].stage == "stereo"
+    assert np.isfinite(seen[-1].figures["loss"])
+    monkeypatch.setattr(stereo, "sweep", None)
+    train_tile(job, Street(frames), tmp_path)
+
+
+def test_without_a_weight_nothing_is_compared(tmp_path):
+    job = tiny_job(frames=drives())
+    assert known_depths(job, Street(drives()), np.arange(15), tmp_path) is None
+    assert not list(tmp_path.iterdir())
