@@ -17,6 +17,7 @@ from tests.stages.test_card_training import card_run
 
 SMALL = (
     "training.ground.weight=0.1",
+    "training.stereo.weight=0.1",
     "training.bfloat16=false",
     "training.batch_rays=8",
     "sampling.proposal_samples=[4, 3]",

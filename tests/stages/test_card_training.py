@@ -19,6 +19,7 @@ from stages.card_ground import CardGround
 from stages.card_training import CardRun
 from stages.ground import SIDEWALK, Ground
 from stages.ray_pool import PixelBatch, RayPool
+from stages.stereo import KnownDepths
 from stages.training import TileTraining, train_tile
 from tests.core.without_card import interpreted
 from tests.stages.small_training import tiny_settings
@@ -71,7 +72,9 @@ def card_run(tmp_path: Path, *overrides: str, table: FrameTable | None = None) -
     table = frames() if table is None else table
     settings = tiny_settings("training.holdout_every=0", *overrides)
     job = TileTraining("t000", table, SUB_FIELDS, settings, feature_channels=3)
-    return CardRun(job, tmp_path, Numbered(), np.arange(len(table)))
+    depths = KnownDepths(np.full((len(table), 2, 3), 8, np.float16), table, WIDTH, "cpu")  # everything 8 m ahead
+    is_known = settings.training.stereo.weight > 0
+    return CardRun(job, tmp_path, Numbered(), np.arange(len(table)), depths=depths if is_known else None)
 
 
 def draws(count: int) -> torch.Tensor:
