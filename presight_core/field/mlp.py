@@ -15,6 +15,8 @@ from presight_core.field.assignment import Assignment
 # Of 64 float32, 1 MiB, so that on a CPU a layer finds most of the one before it in the cache: a step takes 8 % less
 # than with whole layers; 2,048 and 8,192 rows do alike, 1,024 are slower.
 BLOCK_ROWS = 4096
+# In bfloat16 torch compiles machine code for every new number of rows on a CPU: blocks are filled up to a multiple.
+HALF_ROWS = 512
 
 
 class SubFieldMlp(nn.Module):
@@ -70,11 +72,14 @@ class _BlockwiseLayers(torch.autograd.Function):
         ctx.values, ctx.segments, ctx.inputs_type = [], segments, inputs.dtype
         ctx.save_for_backward(*weights)
         for sub_field, first, last in _blocks(segments, inputs.device):
-            values = [inputs[first:last].to(dtype)]
+            values = [_rows(inputs, first, last, dtype)]
+            is_whole = len(values[0]) == last - first
             for number, (weight, bias) in enumerate(zip(weights, biases, strict=True), 1):
-                into = outputs[first:last] if number == len(weights) else None
+                into = outputs[first:last] if number == len(weights) and is_whole else None
                 result = torch.addmm(bias[sub_field], values[-1], weight[sub_field].T, out=into)
-                values.append(result if into is not None else result.relu_())
+                values.append(result.relu_() if number < len(weights) else result)
+            if not is_whole:
+                outputs[first:last] = values[-1][: last - first]
             if remember:
                 ctx.values.append(values[:-1])
         return outputs
@@ -90,15 +95,15 @@ class _BlockwiseLayers(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             of_inputs = gradients[0].new_empty(len(gradients[0]), width, dtype=ctx.inputs_type)
         for (sub_field, first, last), values in zip(_blocks(ctx.segments, weights[0].device), ctx.values, strict=True):
-            gradient = gradients[0][first:last]
+            gradient = _rows(gradients[0], first, last, weights[0].dtype)
             for number in reversed(range(len(weights))):
                 _add_product(of_weights[number][sub_field], gradient, values[number])
                 of_biases[number][sub_field] += gradient.sum(0)
                 if number:
                     gradient = gradient @ weights[number][sub_field]
-                    gradient = torch.ops.aten.threshold_backward(gradient, values[number], 0)
+                    gradient = torch.ops.aten.threshold_backward(gradient, values[number], 0, grad_input=gradient)
                 elif of_inputs is not None:
-                    of_inputs[first:last] = (gradient @ first_weight[sub_field])[:, :width]
+                    of_inputs[first:last] = (gradient @ first_weight[sub_field])[: last - first, :width]
         return of_inputs, None, None, None, *of_weights, *of_biases
 
 
@@ -108,6 +113,18 @@ def _blocks(segments: Sequence[int], device: torch.device) -> Iterator[tuple[int
     for sub_field, (start, end) in enumerate(pairwise(segments)):
         for first in range(start, end, rows):
             yield sub_field, first, min(first + rows, end)
+
+
+def _rows(values: Tensor, first: int, last: int, dtype: torch.dtype) -> Tensor:
+    """Rows first..last in a type; on a CPU in a half type, rows of zeros follow up to a multiple of HALF_ROWS."""
+    lacking = first - last if dtype.itemsize < 4 and values.device.type == "cpu" else 0
+    lacking %= HALF_ROWS
+    if not lacking:
+        return values[first:last].to(dtype)
+    padded = values.new_empty(last - first + lacking, values.shape[1], dtype=dtype)
+    padded[: last - first] = values[first:last]
+    padded[last - first :] = 0
+    return padded
 
 
 def _add_product(total: Tensor, gradient: Tensor, values: Tensor) -> None:

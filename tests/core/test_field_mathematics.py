@@ -258,6 +258,18 @@ def test_half_precision_networks_add_gradients_up_in_single_precision():
     assert network.biases[1].grad.item() == 10_000  # bfloat16 stops counting at 256
 
 
+def test_rows_that_fill_half_precision_blocks_up_change_nothing(monkeypatch):
+    network = random_network((5, 16, 3)).float()
+    network.dtype = torch.bfloat16
+    inputs, assignment, found = torch.randn(50, 5, requires_grad=True), Assignment(torch.tensor([0, 20, 50])), []
+    for rows in (1, 32):
+        monkeypatch.setattr("presight_core.field.mlp.HALF_ROWS", rows)
+        output = network(inputs, assignment)
+        found.append([output, *torch.autograd.grad(output.float().square().sum(), (inputs, *network.parameters()))])
+    for plain, filled in zip(*found, strict=True):
+        torch.testing.assert_close(filled, plain, rtol=0.02, atol=0.02)  # a library sums in another order
+
+
 @pytest.mark.parametrize("exponent", [-3.0, 0.5, 4.0])
 def test_truncated_exponential_agrees_with_finite_differences_within_its_bounds(exponent):
     x = torch.tensor([exponent], dtype=torch.float64, requires_grad=True)
