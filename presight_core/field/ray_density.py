@@ -23,10 +23,12 @@ from presight_core.field.hash_encode.numba_kernels import corner_scratch, encode
 from presight_core.field.hash_grid import HashGrid
 from presight_core.field.mlp import SubFieldMlp
 from presight_core.field.rays import Rays
+from presight_core.field.rendering import LARGEST_EXPONENT
 
 POINTS = 4096  # that go through together: of 40 float32 they take 640 KiB of a second-level cache
 LANES = 16  # hidden values that are calculated at once, each for
 TOGETHER = 4  # samples: what adds up stays in registers
+MOST = np.float32(LARGEST_EXPONENT)
 FLOAT, INT64 = ir.FloatType(), ir.IntType(64)
 VECTOR = ir.VectorType(FLOAT, LANES)
 # Sums in any order; but what is no number, or without end, stays so.
@@ -274,6 +276,6 @@ def _note(edges_m, followed, low, high, density_bias, work, density, optical):  
         for bin in range(low, high):
             i = row[n]
             n += 1
-            value = math.exp(output[i] + density_bias) if inside[i] else np.float32(0)
+            value = math.exp(min(output[i] + density_bias, MOST)) if inside[i] else np.float32(0)
             density[ray, bin] = value
             optical[number] += value * (edges_m[ray, bin + 1] - edges_m[ray, bin])

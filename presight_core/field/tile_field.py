@@ -281,7 +281,7 @@ class TileField(nn.Module):
 
     def proposal_densities(self, points: Float[Tensor, "rays samples 3"]) -> list[Float[Tensor, "rays samples"]]:
         """Density per metre at points, as each proposal network guesses it."""
-        return [self._density(proposal, points) for proposal in self.proposals]
+        return [self._density(cast("DensityNetwork", proposal), points) for proposal in self.proposals]
 
     def conditions(self, rays: Rays) -> Float[Tensor, "rays _"]:
         """What colour depends on beside the place: direction, video and image."""
@@ -305,7 +305,11 @@ class TileField(nn.Module):
         boxes, bias = (self.centroids, self.box_centre, self.box_half), self.shape.settings.density_bias
         return ray_density.ray_density(network.grid, network.network, boxes, rays, edges_m, bias, left)
 
-    def _density(self, network: nn.Module, points: Tensor) -> Tensor:
+    def _density(self, network: DensityNetwork, points: Tensor) -> Tensor:
+        if ray_density.suits(network.grid, points):
+            starts = points.reshape(-1, 3)  # of rays without length
+            rays, edges_m = Rays(starts, torch.zeros_like(starts)), starts.new_zeros(len(starts), 2)
+            return self._ray_density(network, rays, edges_m, 0.0).view(points.shape[:-1])
         assignment, positions, inside = self._locate(points)
         density = network(positions, assignment, 1)[:, 0]
         return assignment.restore(self._activate(density, inside)).view(points.shape[:-1])

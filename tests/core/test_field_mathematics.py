@@ -105,6 +105,13 @@ def test_first_hit_lies_where_half_of_the_weight_is_reached():
     assert depth[0] == 3.0  # a quarter before the third sample, which spans 2..4: halfway through it
 
 
+def test_no_output_is_too_large_for_a_density_and_what_is_opaque_hides_all_behind():
+    density = rendering.truncated_exponential(torch.tensor([[0.0, 89.0, 1000.0, torch.inf]]))
+    weights = rendering.ray_weights(density, torch.full((1, 4), 0.1))
+    torch.testing.assert_close(weights.sum(), torch.tensor(1.0))
+    assert weights[0, 2:].sum() < 1e-6
+
+
 def test_truncated_exponential_has_a_bounded_gradient():
     x = torch.tensor([1.0, 30.0], requires_grad=True)
     rendering.truncated_exponential(x).sum().backward()
