@@ -8,7 +8,7 @@ from presight_core.drives import FrameTable
 
 REACH_M = 14.0  # between cameras: things 10 m away are then seen from quite another side
 MANY = 400  # images within reach; of more, every so many-th is looked at
-DISTANCES_M = (6.0, 11.0, 20.0)  # of the places by which views are compared
+DISTANCES_M = (6.0, 11.0, 20.0, 40.0)  # of the places by which views are compared
 PLACES = (6, 3)  # along an image's width and height
 MARGINS = (0.1, 0.25)  # of width and height: what lies at the rim is in few other images
 BEST_RAD, LARGEST_RAD = np.radians([6.0, 12.0])  # between two looks at a place; beyond, surfaces look different

@@ -1,7 +1,7 @@
 """How far the surfaces in a tile's images are, from neighbouring images alone, before anything is trained.
 
-Each image is compared with the six of its drive that show most of the same (`plane_sweep`). Depths stay where at least
-two images, looked at for themselves, say the same of the place: nine in ten of those are right
+Each image is compared with the eight of its drive that show most of the same (`plane_sweep`). Depths stay where
+another image, looked at for itself, says the same of the place: nine in ten of those are right
 (docs/benchmarks/field.md). The field is then told to end its rays there.
 """
 
@@ -21,17 +21,16 @@ from presight_core.drives import FrameTable
 from presight_core.field.rays import Rays
 from presight_core.images import grey_level, resized
 from presight_core.pixels import PixelSource, cell_of
-from presight_core.plane_sweep import CELL_PX, View, grid_shape, sweep
+from presight_core.plane_sweep import CELL_PX, Cells, View, grid_shape, sweep
 from presight_core.progress import Progress, Report, silent
 from stages.neighbours import Neighbours
 
 LEVEL = classes.lookup(("road", "sidewalk", "terrain"))  # patches of these lie flat, all others face the camera
 NOWHERE = classes.lookup((*classes.DYNAMIC, "sky"))  # no ray of training wants to know where these are
-SOURCES = 6  # images that an image is compared with
+SOURCES = 8  # images that an image is compared with
 JUDGES = 20  # images that are asked whether they found the same
-AGREEING = 2  # of the judges must have
-MIN_CORRELATION = 0.6
-MAX_DIFFERENCE = 0.04  # between depths that agree, a share
+AGREEING = 1  # of the judges must have; with two, fields find less and are hardly purer
+MAX_DIFFERENCE = 0.04  # between depths that agree, a share; their mean is more exact than any of them
 KEPT_VIEWS = 512  # small images in memory, 50 MB: a drive's neighbours follow each other in time
 
 DepthMaps = Float16[NDArray, "images rows columns"]  # metres along the optical axis; 0 where nothing is known
@@ -106,29 +105,35 @@ class _Comparison:
         others = self._neighbours.of(image)
         others = others[self._drive_id[others] == self._drive_id[image]][:SOURCES].tolist()
         if others:
-            found = sweep(*self._view(image), [self._view(other)[0] for other in others])
-            _put(guesses[image], np.where(found.correlation > MIN_CORRELATION, found.depth_m, 0))
+            _put(guesses[image], sweep(*self._view(image), [self._view(other)[0] for other in others]))
 
     def judge(self, image: int, guesses: DepthMaps, agreed: DepthMaps) -> None:
-        """Write the guesses with which those of other images, of any drive, agree."""
+        """Write the guesses with which those of other images, of any drive, agree: the mean of all of them."""
         camera = self._cameras[image]
-        rows, columns = grid_shape(camera.width_px, camera.height_px)
-        depth_m = guesses[image, :rows, :columns].astype(np.float64).ravel()
-        origin, directions = camera.rays(pixel_centres(camera.width_px, camera.height_px, CELL_PX))
-        points = origin + (depth_m / (directions @ camera.world_from_camera[:3, 2]))[:, None] * directions
-        votes = np.zeros(len(points), np.int64)
+        shape = grid_shape(camera.width_px, camera.height_px)
+        depth_m = guesses[image, : shape[0], : shape[1]].astype(np.float64).ravel()
+        known = np.flatnonzero(depth_m)
+        origin, directions = camera.rays(pixel_centres(camera.width_px, camera.height_px, CELL_PX)[known])
+        points = origin + (depth_m[known] / (directions @ camera.world_from_camera[:3, 2]))[:, None] * directions
+        votes, total = np.zeros(len(known), np.int64), np.zeros(len(known))
         for judge in self._neighbours.of(image)[:JUDGES].tolist():
-            votes += _agrees(self._cameras[judge], guesses[judge], points)
-        _put(agreed[image], np.where(votes >= AGREEING, depth_m, 0).reshape(rows, columns))
+            difference = _difference(self._cameras[judge], guesses[judge], points)
+            agrees = np.abs(difference) < MAX_DIFFERENCE
+            votes += agrees
+            total += np.where(agrees, difference, 0)
+        depth_m[known] *= np.where(votes >= AGREEING, 1 + total / (votes + 1), 0)  # its own guess is one, too
+        _put(agreed[image], depth_m.reshape(shape))
 
-    def _load(self, image: int) -> tuple[View, Float[NDArray, "rows columns 3"]]:
-        """A small grey image, and how the surface lies in each cell, in the camera's axes."""
+    def _load(self, image: int) -> tuple[View, Cells]:
+        """A small grey image, and what labels tell of its cells."""
         camera, pixels = self._cameras[image], self._images.source.load(int(self._images.rows[image]))
         size_px = camera.width_px, camera.height_px
         labels = pixels.labels[cell_of(pixel_centres(*size_px, CELL_PX), size_px, pixels.labels.shape)]
         normals = np.where(LEVEL[labels][:, None], camera.world_from_camera[2, :3], (0.0, 0.0, 1.0))
         normals[NOWHERE[labels]] = 0
-        return View(grey_level(resized(pixels.rgb, *size_px)), camera), normals.reshape(*grid_shape(*size_px), 3)
+        shape = grid_shape(*size_px)
+        view = View(grey_level(resized(pixels.rgb, *size_px)), camera)
+        return view, Cells(normals.reshape(*shape, 3), labels.reshape(shape))
 
 
 def small_cameras(frames: FrameTable, width_px: int) -> list[Camera]:
@@ -141,14 +146,16 @@ def small_cameras(frames: FrameTable, width_px: int) -> list[Camera]:
     ]
 
 
-def _agrees(camera: Camera, guess: Float16[NDArray, "rows columns"], points_world: NDArray) -> NDArray[np.bool_]:
-    """Which points (N, 3) in the world a camera's image puts where they are."""
+def _difference(
+    camera: Camera, guess: Float16[NDArray, "rows columns"], points_world: NDArray
+) -> Float[NDArray, " points"]:
+    """How much farther than points (N, 3) in the world a camera's guess puts what is there, a share; NaN outside."""
     pixels, depth_m = camera.project(points_world)
     inside = np.flatnonzero(np.all((pixels >= 0) & (pixels < [camera.width_px, camera.height_px]), axis=-1))
     columns, rows = np.minimum(pixels[inside] // CELL_PX, np.array(guess.shape)[::-1] - 1).astype(np.int64).T
-    agrees = np.zeros(len(points_world), np.bool_)
-    agrees[inside] = np.abs(guess[rows, columns] / depth_m[inside] - 1) < MAX_DIFFERENCE
-    return agrees
+    difference = np.full(len(points_world), np.nan)
+    difference[inside] = guess[rows, columns] / depth_m[inside] - 1
+    return difference
 
 
 def _put(grid: DepthMaps, depths_m: NDArray) -> None:

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from presight_core.cameras import Camera
-from presight_core.plane_sweep import CELL_PX, View, grid_shape, sweep
+from presight_core.plane_sweep import CELL_PX, Cells, View, grid_shape, sweep
 from tests.patterned_scene import FOCAL, GROUND, HEIGHT, WIDTH, Plane, camera_at, depth_m, picture, wall
 
 REFERENCE = camera_at(0, 0)
 BESIDE = [camera_at(0, y_m) for y_m in (-1.0, -0.5, 0.5, 1.0)]
 SHAPE = grid_shape(WIDTH, HEIGHT)
-FACING = np.broadcast_to((0.0, 0.0, 1.0), (*SHAPE, 3))
+FACING = Cells(np.broadcast_to((0.0, 0.0, 1.0), (*SHAPE, 3)), np.zeros(SHAPE, np.uint8))
+LEVEL = Cells(np.broadcast_to((0.0, -1.0, 0.0), (*SHAPE, 3)), FACING.labels)  # up, in a level camera's axes
 INNER = np.s_[2:-2, 6:-6]  # cells that most of the cameras see
 
 
@@ -30,8 +31,7 @@ def true_depth_m(*planes: Plane) -> np.ndarray:
 def test_a_wall_is_found_where_it_stands(distance_m):
     found = sweep(view(REFERENCE, wall(distance_m)), FACING, views(BESIDE, wall(distance_m)))
     disparity_px = FOCAL * 1.0 / distance_m  # between the cameras that stand farthest beside
-    assert np.abs(found.depth_m[INNER] / distance_m - 1).max() < 0.75 / disparity_px
-    assert found.correlation[INNER].min() > 0.8
+    assert np.abs(found[INNER] / distance_m - 1).max() < 0.75 / disparity_px
 
 
 def test_a_patch_of_the_ground_lies_level():
@@ -39,20 +39,18 @@ def test_a_patch_of_the_ground_lies_level():
     sources = views(ahead, GROUND)
     truth = true_depth_m(GROUND)
     rows = (truth[:, 0] > 7) & (truth[:, 0] < 11)  # nearer other cameras do not see it, farther pixels are coarse
-    level = np.broadcast_to((0.0, -1.0, 0.0), FACING.shape)  # up, in a level camera's axes
     errors = [
-        np.abs(sweep(view(REFERENCE, GROUND), normals, sources).depth_m / truth - 1)[rows, 6:-6]
-        for normals in (level, FACING)
+        np.abs(sweep(view(REFERENCE, GROUND), cells, sources) / truth - 1)[rows, 6:-6] for cells in (LEVEL, FACING)
     ]
-    assert (errors[0] < 0.03).mean() > 0.8
-    assert (errors[1] < 0.03).mean() < 0.5
+    assert (errors[0] < 0.04).mean() > 0.95
+    assert (errors[1] < 0.04).mean() < 0.8
 
 
 def test_the_exposure_of_other_images_does_not_matter():
     sources = views(BESIDE, wall(9.0))
     darker = [View((source.grey * 0.4 + 30).astype(np.uint8), source.camera) for source in sources]
     plain, found = (sweep(view(REFERENCE, wall(9.0)), FACING, each) for each in (sources, darker))
-    np.testing.assert_allclose(found.depth_m[INNER], plain.depth_m[INNER], rtol=0.02)
+    np.testing.assert_allclose(found[INNER], plain[INNER], rtol=0.02)
 
 
 def test_two_images_that_see_the_place_are_enough():
@@ -60,25 +58,29 @@ def test_two_images_that_see_the_place_are_enough():
     hidden = [View(random.integers(0, 255, (HEIGHT, WIDTH), np.uint8), camera) for camera in BESIDE[:2]]
     found = sweep(view(REFERENCE, wall(9.0)), FACING, [*hidden, *views(BESIDE[2:], wall(9.0))])
     inner = np.s_[2:-2, 2:-8]  # both remaining cameras stand to the left
-    assert (np.abs(found.depth_m[inner] / 9.0 - 1) < 0.06).mean() > 0.95
+    assert (np.abs(found[inner] / 9.0 - 1) < 0.06).mean() > 0.95
 
 
-def test_nothing_is_told_where_the_image_is_plain_or_nothing_is_looked_for():
+def test_what_is_plain_is_filled_from_what_is_around_it():
     grey = picture(REFERENCE, wall(9.0))
-    grey[:, : WIDTH // 2] = 90
-    normals = FACING.copy()
+    grey[20:40, 40:60] = 90
+    found = sweep(View(grey, REFERENCE), FACING, views(BESIDE, wall(9.0)))
+    assert np.abs(found[20 // CELL_PX : 40 // CELL_PX, 40 // CELL_PX : 60 // CELL_PX] / 9.0 - 1).max() < 0.15
+
+
+def test_nothing_is_told_where_nothing_is_looked_for():
+    normals = FACING.normals.copy()
     normals[: SHAPE[0] // 2] = 0
-    found = sweep(View(grey, REFERENCE), normals, views(BESIDE, wall(9.0)))
-    rows, columns = SHAPE
-    assert (found.correlation[: rows // 2] == -1).all()
-    assert (found.correlation[:, : columns // 2 - 1] == -1).all()
-    assert found.correlation[rows // 2 : -2, columns // 2 + 2 : -6].min() > 0.8
+    found = sweep(view(REFERENCE, wall(9.0)), Cells(normals, FACING.labels), views(BESIDE, wall(9.0)))
+    assert not found[: SHAPE[0] // 2].any()
+    assert (found[SHAPE[0] // 2 :] > 0).all()
 
 
-def test_nothing_is_told_where_no_other_image_looks():
-    behind = camera_at(0, 0.5, np.pi)
-    found = sweep(view(REFERENCE, wall(9.0)), FACING, [View(picture(REFERENCE, wall(9.0)), behind)])
-    assert (found.correlation <= 0).all()
+@pytest.mark.parametrize("yaw_rad", [np.pi, 0.0])
+def test_nothing_is_told_where_no_other_image_looks_or_all_is_plain(yaw_rad):
+    grey = picture(REFERENCE, wall(9.0)) if yaw_rad else np.full((HEIGHT, WIDTH), 90, np.uint8)
+    sources = [View(grey, camera_at(0, y_m, yaw_rad)) for y_m in (-0.5, 0.5)]
+    assert not sweep(View(grey, REFERENCE), FACING, sources).any()
 
 
 def test_the_result_does_not_depend_on_the_number_of_threads(monkeypatch):
@@ -87,4 +89,4 @@ def test_the_result_does_not_depend_on_the_number_of_threads(monkeypatch):
     for count in (1, 3):
         monkeypatch.setattr("numba.get_num_threads", lambda count=count: count)
         results.append(sweep(*given))
-    np.testing.assert_array_equal(results[0].depth_m, results[1].depth_m)
+    np.testing.assert_array_equal(*results)

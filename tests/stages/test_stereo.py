@@ -93,7 +93,7 @@ def test_an_image_that_shows_something_else_has_no_depths(tmp_path, monkeypatch)
     monkeypatch.setattr(Street, "load", load)
     maps = depth_maps(images_of(frames), WIDTH, tmp_path / "depths.npy")
     shares = (maps > 0).mean((1, 2))
-    assert shares[strange] < 0.02
+    assert shares[strange] < 0.05  # a guess in 25 agrees by chance
     assert np.delete(shares, strange).mean() > 0.25
 
 

@@ -1,0 +1,63 @@
+"""Depths of cells that suit those around them, on grids made by hand."""
+
+import numpy as np
+import pytest
+
+from presight_core.semi_global import best_places
+
+SHAPE = 9, 12
+DEPTHS = 20
+NEARNESS = np.linspace(0.5, 0.02, DEPTHS)
+FACING = np.broadcast_to((0.0, 0.0, 1.0), (*SHAPE, 3))  # the same nearness everywhere
+ALIKE = np.zeros(SHAPE, np.uint8)
+
+
+def scores_at(places: np.ndarray, best: float = 0.9) -> np.ndarray:
+    """Scores that fall off to both sides of each cell's place."""
+    away = np.abs(np.arange(DEPTHS) - places[..., None])
+    return np.clip(best - 0.3 * away, 0, 1)
+
+
+def test_cells_that_all_agree_keep_their_depth_and_its_fraction():
+    for place in (7.0, 7.3, 7.7):
+        places = best_places(scores_at(np.full(SHAPE, place)), FACING, ALIKE, NEARNESS)
+        np.testing.assert_allclose(places, place, atol=0.2)
+
+
+def test_a_cell_that_is_plain_takes_the_depth_of_those_around_it():
+    scores = scores_at(np.full(SHAPE, 7.0))
+    scores[3:6, 4:8] = 0
+    np.testing.assert_allclose(best_places(scores, FACING, ALIKE, NEARNESS), 7, atol=0.2)
+
+
+def test_a_cell_alone_against_all_others_gives_way_unless_it_is_another_thing():
+    places, labels = np.full(SHAPE, 7.0), ALIKE.copy()
+    places[4, 6] = 15
+    assert best_places(scores_at(places, 0.8), FACING, ALIKE, NEARNESS)[4, 6] == pytest.approx(7, abs=0.5)
+    labels[4, 6] = 5
+    assert best_places(scores_at(places, 0.8), FACING, labels, NEARNESS)[4, 6] == pytest.approx(15, abs=0.5)
+
+
+def test_what_two_halves_show_well_stays_apart():
+    places = np.full(SHAPE, 4.0)
+    places[:, 6:] = 15
+    np.testing.assert_allclose(best_places(scores_at(places), FACING, ALIKE, NEARNESS), places, atol=0.5)
+
+
+def test_plain_ground_goes_on_as_ground():
+    """The nearness of the ground falls evenly from row to row: only its first and last rows have a pattern."""
+    nearness = np.broadcast_to((0.45 - 0.05 * np.arange(SHAPE[0]))[:, None], SHAPE)
+    truth = (nearness - NEARNESS[0]) / (NEARNESS[1] - NEARNESS[0])
+    scores = scores_at(truth)
+    scores[2:-2] = 0
+    ground = np.broadcast_to((0.0, -0.05, 0.45), (*SHAPE, 3))
+    np.testing.assert_allclose(best_places(scores, ground, ALIKE, NEARNESS), truth, atol=0.6)
+    assert np.abs(best_places(scores, FACING, ALIKE, NEARNESS) - truth)[2:-2].max() > 2
+
+
+def test_no_path_crosses_cells_that_are_left_out():
+    scores, planes = scores_at(np.full(SHAPE, 7.0)), FACING.copy()
+    scores[:, 5:], planes[:, 5] = 0, 0  # a column of sky, and behind it nothing but plain cells
+    places = best_places(scores, planes, ALIKE, NEARNESS)
+    np.testing.assert_allclose(places[:, :5], 7, atol=0.2)
+    assert np.isnan(places[:, 5:]).all()
