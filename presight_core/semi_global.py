@@ -3,7 +3,7 @@
 Semi-global matching (Hirschmüller, Stereo processing by semi-global matching and mutual information, 2008): along paths
 from eight sides the depth of a cell may stay on the surface of the cell before it for nothing, step beside it for
 little, and leave it for more. So what is plain is filled from what has a pattern. Surfaces are planes of known slant
-(Scharstein and others, Surface normal priors, 2017): the ground goes on as ground.
+(Scharstein and others, Semi-global stereo matching with surface orientation priors, 2017): ground goes on as ground.
 """
 
 import numba
