@@ -3,7 +3,8 @@
 Around a pixel a small patch of surface is put at one distance after the other (Collins, A space-sweep approach to true
 multi-image matching, 1996). Where it is right, the other images show the patch as the first one does, whatever the
 exposure: the correlation of their grey values is near 1. Which distance is taken depends on the cells around, too
-(`semi_global`). Nothing is learned, and poses must be known.
+(`semi_global`). Then patches are laid into the planes that the cells around them lie in, and looked at again. Nothing
+is learned, and poses must be known.
 """
 
 from collections.abc import Sequence
@@ -11,11 +12,12 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numba import prange
 from numpy.typing import NDArray
 
 from presight_core.cameras import Camera, pixel_centres
+from presight_core.local_planes import planes_around
 from presight_core.semi_global import best_places
 
 CELL_PX = 4  # a depth is found for every fourth pixel of every fourth row
@@ -23,9 +25,13 @@ CELL_PX = 4  # a depth is found for every fourth pixel of every fourth row
 # white ones a sweep takes a quarter longer, and gains next to nothing.
 PATCH_PX = 2 * np.mgrid[-2:3, -2:3][::-1].reshape(2, -1).T[::2]
 NEAREST_M, FARTHEST_M = 2.5, 150.0  # what is farther than can be told should not be taken for near
-DEPTH_COUNT = 200  # even in 1 / depth; with 134 the middle error is 1.3 times as large beyond 30 m, in 30 % less time
+DEPTH_COUNT = 200  # with 134 the middle error is 1.3 times as large beyond 30 m, in 30 % less time
+NEARNESS = np.linspace(1 / NEAREST_M, 1 / FARTHEST_M, DEPTH_COUNT)  # 1 / depth, at even steps
 MIN_CONTRAST = 2.0  # grey levels, standard deviation in a patch: flatter ones match anything
 REACH_M = np.float32(0.5)  # nearer to a source's image plane than this nothing is looked for
+TURNS = 2  # how often patches are laid anew
+NEAR_STEPS = 10  # depths to each side of the one found before that a patch laid anew is put at
+FLAT = np.float32(0.05)  # grey levels, squared: sources that differ less than that show nothing
 MAX_TILT = 2.0  # a patch is at most so many times nearer or farther at its rim than at its centre
 
 
@@ -42,6 +48,7 @@ class Cells:
     """What is known of the surface in each cell of an image."""
 
     normals: Float[NDArray, "rows columns 3"]  # in the camera's axes, of any length; 0: nothing is looked for
+    is_known: Bool[NDArray, "rows columns"]  # False: the normal is a first guess
     labels: UInt8[NDArray, "rows columns"]  # where they differ, a surface seldom goes on
 
 
@@ -50,34 +57,85 @@ def sweep(reference: View, cells: Cells, sources: Sequence[View]) -> Float[NDArr
 
     0 where nothing is known. There must be two sources at least, all of one size.
     """
-    camera, normals = reference.camera, cells.normals.reshape(-1, 3)
-    pixels = pixel_centres(camera.width_px, camera.height_px, CELL_PX)
-    turns, shifts = _motions(camera, [source.camera for source in sources])
-    patches, has_contrast = _patches(reference.grey, pixels)
-    scores = np.zeros((len(pixels), DEPTH_COUNT), np.float32)
-    nearness = np.linspace(1 / NEAREST_M, 1 / FARTHEST_M, DEPTH_COUNT)
-    _fill_scores(
-        np.flatnonzero(has_contrast & normals.any(-1)),
-        patches,
-        _patch_rays(camera, pixels, normals),
-        np.stack([source.grey.ravel() for source in sources]),
-        np.array(sources[0].grey.shape[::-1], np.int32),
-        turns,
-        shifts,
-        (1 / nearness).astype(np.float32),
-        scores,
-        numba.get_num_threads(),
-    )
-    volume = scores.reshape(*cells.labels.shape, DEPTH_COUNT)
-    places = best_places(volume, _planes(camera, cells.normals), cells.labels, nearness)
-    depth_m = 1 / np.interp(places, np.arange(DEPTH_COUNT), nearness)
-    return np.nan_to_num(depth_m, nan=0.0).astype(np.float32)
+    volume = _Volume(reference, cells, sources)
+    volume.score(cells.normals, ~np.zeros_like(cells.is_known))
+    places = volume.best_places(cells.normals)
+    for _ in range(TURNS):
+        normals, is_new = _turned(reference.camera, cells, places)
+        volume.score(normals, is_new, places)
+        places = volume.best_places(normals)
+    return np.nan_to_num(1 / _nearness(places), nan=0.0).astype(np.float32)
+
+
+class _Volume:
+    """How well each depth suits each cell."""
+
+    def __init__(self, reference: View, cells: Cells, sources: Sequence[View]) -> None:
+        self._camera, self._labels = reference.camera, cells.labels
+        self._pixels = pixel_centres(self._camera.width_px, self._camera.height_px, CELL_PX)
+        self._motions = _motions(self._camera, [source.camera for source in sources])
+        self._patches, self._has_contrast = _patches(reference.grey, self._pixels)
+        self._sources = np.stack([source.grey.ravel() for source in sources])
+        self._size_px = np.array(sources[0].grey.shape[::-1], np.int32)
+        self._scores = np.zeros((len(self._pixels), DEPTH_COUNT), np.float32)
+
+    def score(
+        self,
+        normals: Float[NDArray, "rows columns 3"],
+        chosen: Bool[NDArray, "rows columns"],
+        places: Float[NDArray, "rows columns"] | None = None,
+    ) -> None:
+        """Look at patches with the normals in the chosen cells, at all depths or those near the given ones."""
+        normals = normals.reshape(-1, 3)
+        middle = np.zeros(len(normals)) if places is None else np.nan_to_num(places.ravel())
+        reach = DEPTH_COUNT if places is None else NEAR_STEPS
+        _fill_scores(
+            np.flatnonzero(self._has_contrast & normals.any(-1) & chosen.ravel()),
+            self._patches,
+            _patch_rays(self._camera, self._pixels, normals),
+            self._sources,
+            self._size_px,
+            *self._motions,
+            (1 / NEARNESS).astype(np.float32),
+            (middle - reach).clip(0, DEPTH_COUNT).astype(np.int32),
+            (middle + reach).clip(0, DEPTH_COUNT).astype(np.int32),
+            self._scores,
+            numba.get_num_threads(),
+        )
+
+    def best_places(self, normals: Float[NDArray, "rows columns 3"]) -> Float[NDArray, "rows columns"]:
+        """Which depths suit the cells and those around them; NaN where nothing is known."""
+        volume = self._scores.reshape(*self._labels.shape, DEPTH_COUNT)
+        return best_places(volume, _planes(self._camera, normals), self._labels, NEARNESS)
 
 
 def grid_shape(width_px: int, height_px: int) -> tuple[int, int]:
     """Rows and columns of the cells of an image."""
     rows, columns = (len(range(CELL_PX // 2, size, CELL_PX)) for size in (height_px, width_px))
     return rows, columns
+
+
+def _nearness(places: Float[NDArray, "rows columns"]) -> Float[NDArray, "rows columns"]:
+    """1 / depth of places between the depths that are looked at."""
+    return np.interp(places, np.arange(DEPTH_COUNT), NEARNESS)
+
+
+def _turned(
+    camera: Camera, cells: Cells, places: Float[NDArray, "rows columns"]
+) -> tuple[Float[NDArray, "rows columns 3"], Bool[NDArray, "rows columns"]]:
+    """Normals of the planes that the cells around each cell lie in, and where there is such a plane.
+
+    Elsewhere, and where they are known, normals stay.
+    """
+    planes = planes_around(np.nan_to_num(_nearness(places)).astype(np.float32), cells.labels)
+    is_new = planes.any(-1) & cells.normals.any(-1) & ~cells.is_known
+    normals = planes @ np.linalg.inv(_pixel_from_cell()) @ camera.intrinsics
+    return np.where(is_new[..., None], normals, cells.normals), is_new
+
+
+def _pixel_from_cell() -> NDArray[np.float64]:
+    """Takes a cell's column and row to the pixel in its middle, homogeneous."""
+    return np.array([[CELL_PX, 0, CELL_PX / 2], [0, CELL_PX, CELL_PX / 2], [0, 0, 1]])
 
 
 def _motions(camera: Camera, others: list[Camera]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -121,20 +179,19 @@ def _patch_rays(
 
 def _planes(camera: Camera, normals: Float[NDArray, "rows columns 3"]) -> Float[NDArray, "rows columns 3"]:
     """The planes with the normals as `best_places` wants them: 1 / depth at the middles of cells."""
-    pixel_from_cell = np.array([[CELL_PX, 0, CELL_PX / 2], [0, CELL_PX, CELL_PX / 2], [0, 0, 1]])
-    return normals @ np.linalg.inv(camera.intrinsics) @ pixel_from_cell
+    return normals @ np.linalg.inv(camera.intrinsics) @ _pixel_from_cell()
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
-def _fill_scores(cells, patches, rays, sources, size_px, turns, shifts, depths_m, scores, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
-    """Fill, for the cells of the list, how well the two sources that suit each depth best agree with it (0..1)."""
+def _fill_scores(cells, patches, rays, sources, size_px, turns, shifts, depths_m, first, last, scores, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
+    """Fill, for the cells of the list and their depths first..last, how well the best two sources agree (0..1)."""
     for worker in prange(worker_count):
         seen = np.empty((len(turns), 3, patches.shape[1]), np.float32)
         at = np.empty(patches.shape[1], np.uint32)
         for place in range(worker, len(cells), worker_count):
             cell = cells[place]
             _turn(rays, cell, turns, seen)
-            for depth in range(len(depths_m)):
+            for depth in range(first[cell], last[cell]):
                 best, second = np.float32(-1), np.float32(-1)
                 for source in range(len(turns)):
                     if _project(seen, shifts, source, depths_m[depth], size_px, at):
@@ -190,4 +247,4 @@ def _correlation(patches, cell, sources, source, at):
         squares += value * value
         common += value * patches[cell, i]
     spread = squares - total * total / count
-    return common / np.sqrt(spread) if spread > count else np.float32(0)
+    return common / np.sqrt(spread) if spread > FLAT * count else np.float32(0)

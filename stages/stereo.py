@@ -25,7 +25,7 @@ from presight_core.plane_sweep import CELL_PX, Cells, View, grid_shape, sweep
 from presight_core.progress import Progress, Report, silent
 from stages.neighbours import Neighbours
 
-LEVEL = classes.lookup(("road", "sidewalk", "terrain"))  # patches of these lie flat, all others face the camera
+LEVEL = classes.lookup(("road", "sidewalk", "terrain"))  # patches of these lie flat, others face the camera at first
 NOWHERE = classes.lookup((*classes.DYNAMIC, "sky"))  # no ray of training wants to know where these are
 SOURCES = 8  # images that an image is compared with
 JUDGES = 20  # images that are asked whether they found the same
@@ -133,7 +133,7 @@ class _Comparison:
         normals[NOWHERE[labels]] = 0
         shape = grid_shape(*size_px)
         view = View(grey_level(resized(pixels.rgb, *size_px)), camera)
-        return view, Cells(normals.reshape(*shape, 3), labels.reshape(shape))
+        return view, Cells(normals.reshape(*shape, 3), LEVEL[labels].reshape(shape), labels.reshape(shape))
 
 
 def small_cameras(frames: FrameTable, width_px: int) -> list[Camera]:

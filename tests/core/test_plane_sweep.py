@@ -1,5 +1,7 @@
 """Depths of planes with a pattern, from cameras side by side."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,10 @@ from tests.patterned_scene import FOCAL, GROUND, HEIGHT, WIDTH, Plane, camera_at
 REFERENCE = camera_at(0, 0)
 BESIDE = [camera_at(0, y_m) for y_m in (-1.0, -0.5, 0.5, 1.0)]
 SHAPE = grid_shape(WIDTH, HEIGHT)
-FACING = Cells(np.broadcast_to((0.0, 0.0, 1.0), (*SHAPE, 3)), np.zeros(SHAPE, np.uint8))
-LEVEL = Cells(np.broadcast_to((0.0, -1.0, 0.0), (*SHAPE, 3)), FACING.labels)  # up, in a level camera's axes
+FACING = Cells(np.broadcast_to((0.0, 0.0, 1.0), (*SHAPE, 3)), np.zeros(SHAPE, np.bool_), np.zeros(SHAPE, np.uint8))
+LEVEL = replace(
+    FACING, normals=np.broadcast_to((0.0, -1.0, 0.0), (*SHAPE, 3)), is_known=~FACING.is_known
+)  # up, in a level camera's axes
 INNER = np.s_[2:-2, 6:-6]  # cells that most of the cameras see
 
 
@@ -34,16 +38,28 @@ def test_a_wall_is_found_where_it_stands(distance_m):
     assert np.abs(found[INNER] / distance_m - 1).max() < 0.75 / disparity_px
 
 
-def test_a_patch_of_the_ground_lies_level():
+def ground_errors(cells: Cells) -> np.ndarray:
+    """Relative errors of the ground from 7 to 11 m: nearer no other camera sees it, farther pixels are coarse."""
     ahead = [camera_at(x_m, y_m) for x_m, y_m in ((1.0, -0.7), (1.0, 0.7), (2.0, 0.0), (-1.0, 0.5))]
-    sources = views(ahead, GROUND)
     truth = true_depth_m(GROUND)
-    rows = (truth[:, 0] > 7) & (truth[:, 0] < 11)  # nearer other cameras do not see it, farther pixels are coarse
-    errors = [
-        np.abs(sweep(view(REFERENCE, GROUND), cells, sources) / truth - 1)[rows, 6:-6] for cells in (LEVEL, FACING)
-    ]
-    assert (errors[0] < 0.04).mean() > 0.95
-    assert (errors[1] < 0.04).mean() < 0.8
+    rows = (truth[:, 0] > 7) & (truth[:, 0] < 11)
+    return np.abs(sweep(view(REFERENCE, GROUND), cells, views(ahead, GROUND)) / truth - 1)[rows, 6:-6]
+
+
+def test_a_patch_of_the_ground_lies_level():
+    level, facing = (ground_errors(cells) for cells in (LEVEL, replace(FACING, is_known=LEVEL.is_known)))
+    assert (level < 0.04).mean() > 0.95
+    assert (facing < 0.04).mean() < 0.8
+
+
+def test_a_patch_that_only_faces_the_camera_at_first_is_laid_into_the_plane_of_its_surroundings():
+    facade = Plane((0.866, 0.5, 0.0), 5.0)  # 30 degrees off, nearer to the left
+    truth, sources = true_depth_m(facade), views(BESIDE, facade)
+    known, guessed = (
+        np.median(np.abs(sweep(view(REFERENCE, facade), cells, sources) / truth - 1)[INNER])
+        for cells in (replace(FACING, is_known=LEVEL.is_known), FACING)
+    )
+    assert guessed < 0.5 * known
 
 
 def test_the_exposure_of_other_images_does_not_matter():
@@ -71,7 +87,7 @@ def test_what_is_plain_is_filled_from_what_is_around_it():
 def test_nothing_is_told_where_nothing_is_looked_for():
     normals = FACING.normals.copy()
     normals[: SHAPE[0] // 2] = 0
-    found = sweep(view(REFERENCE, wall(9.0)), Cells(normals, FACING.labels), views(BESIDE, wall(9.0)))
+    found = sweep(view(REFERENCE, wall(9.0)), replace(FACING, normals=normals), views(BESIDE, wall(9.0)))
     assert not found[: SHAPE[0] // 2].any()
     assert (found[SHAPE[0] // 2 :] > 0).all()
 
