@@ -12,11 +12,13 @@ from torch.nn import functional
 
 from presight_core.field.assignment import Assignment
 
-# Of 64 float32, 1 MiB, so that on a CPU a layer finds most of the one before it in the cache: a step takes 8 % less
-# than with whole layers; 2,048 and 8,192 rows do alike, 1,024 are slower.
-BLOCK_ROWS = 4096
+# Of 64 values, so that on a CPU a layer finds most of the one before it in the cache: a step takes 8 % less than with
+# whole layers; half and twice as many do alike, a quarter is slower.
+BLOCK_BYTES = 1 << 20
 # In bfloat16 torch compiles machine code for every new number of rows on a CPU: blocks are filled up to a multiple.
 HALF_ROWS = 512
+# bfloat16's -inf read as int16: of negative numbers only those that are none, NaN, are greater.
+MINUS_INFINITY = -128
 
 
 class SubFieldMlp(nn.Module):
@@ -71,13 +73,13 @@ class _BlockwiseLayers(torch.autograd.Function):
         outputs = inputs.new_empty(len(inputs), weights[-1].shape[1], dtype=dtype)
         ctx.values, ctx.segments, ctx.inputs_type = [], segments, inputs.dtype
         ctx.save_for_backward(*weights)
-        for sub_field, first, last in _blocks(segments, inputs.device):
+        for sub_field, first, last in _blocks(segments, inputs.device, dtype):
             values = [_rows(inputs, first, last, dtype)]
             is_whole = len(values[0]) == last - first
             for number, (weight, bias) in enumerate(zip(weights, biases, strict=True), 1):
                 into = outputs[first:last] if number == len(weights) and is_whole else None
                 result = torch.addmm(bias[sub_field], values[-1], weight[sub_field].T, out=into)
-                values.append(result.relu_() if number < len(weights) else result)
+                values.append(_relu_(result) if number < len(weights) else result)
             if not is_whole:
                 outputs[first:last] = values[-1][: last - first]
             if remember:
@@ -87,29 +89,30 @@ class _BlockwiseLayers(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         weights = ctx.saved_tensors
-        total_type = torch.promote_types(weights[0].dtype, torch.float32)  # sums of many rows are no half numbers
+        device, dtype = weights[0].device, weights[0].dtype
+        total_type = torch.promote_types(dtype, torch.float32)  # sums of many rows are no half numbers
         of_weights = [torch.zeros_like(weight, dtype=total_type) for weight in weights]
         of_biases = [weight.new_zeros(weight.shape[:2], dtype=total_type) for weight in weights]
         of_inputs, width = None, weights[0].shape[2]
         first_weight = functional.pad(weights[0], (0, -width % 8))  # products of 48 columns take half of those of 47
         if ctx.needs_input_grad[0]:
             of_inputs = gradients[0].new_empty(len(gradients[0]), width, dtype=ctx.inputs_type)
-        for (sub_field, first, last), values in zip(_blocks(ctx.segments, weights[0].device), ctx.values, strict=True):
-            gradient = _rows(gradients[0], first, last, weights[0].dtype)
+        for (sub_field, first, last), values in zip(_blocks(ctx.segments, device, dtype), ctx.values, strict=True):
+            gradient = _rows(gradients[0], first, last, dtype)
             for number in reversed(range(len(weights))):
                 _add_product(of_weights[number][sub_field], gradient, values[number])
                 of_biases[number][sub_field] += gradient.sum(0)
                 if number:
                     gradient = gradient @ weights[number][sub_field]
-                    gradient = torch.ops.aten.threshold_backward(gradient, values[number], 0, grad_input=gradient)
+                    _zero_where_cut(gradient, values[number])
                 elif of_inputs is not None:
                     of_inputs[first:last] = (gradient @ first_weight[sub_field])[: last - first, :width]
         return of_inputs, None, None, None, *of_weights, *of_biases
 
 
-def _blocks(segments: Sequence[int], device: torch.device) -> Iterator[tuple[int, int, int]]:
+def _blocks(segments: Sequence[int], device: torch.device, dtype: torch.dtype) -> Iterator[tuple[int, int, int]]:
     """Sub-field, first row and end of each block; elsewhere than on a CPU a sub-field is one block."""
-    rows = BLOCK_ROWS if device.type == "cpu" else max(segments[-1], 1)
+    rows = BLOCK_BYTES // (64 * dtype.itemsize) if device.type == "cpu" else max(segments[-1], 1)
     for sub_field, (start, end) in enumerate(pairwise(segments)):
         for first in range(start, end, rows):
             yield sub_field, first, min(first + rows, end)
@@ -125,6 +128,25 @@ def _rows(values: Tensor, first: int, last: int, dtype: torch.dtype) -> Tensor:
     padded[: last - first] = values[first:last]
     padded[last - first :] = 0
     return padded
+
+
+def _relu_(values: Tensor) -> Tensor:
+    """ReLU in place. On a CPU bfloat16 goes through float32 and back, which takes four times as long as integers do."""
+    if not _counts_as_integers(values):
+        return values.relu_()
+    torch.threshold_(values.view(torch.int16), MINUS_INFINITY, 0)
+    return values
+
+
+def _zero_where_cut(gradient: Tensor, values: Tensor) -> None:
+    """The gradient of ReLU in place, where it gave these values."""
+    if _counts_as_integers(values):
+        gradient, values = gradient.view(torch.int16), values.view(torch.int16)
+    torch.ops.aten.threshold_backward(gradient, values, 0, grad_input=gradient)
+
+
+def _counts_as_integers(values: Tensor) -> bool:
+    return values.dtype == torch.bfloat16 and values.device.type == "cpu"
 
 
 def _add_product(total: Tensor, gradient: Tensor, values: Tensor) -> None:

@@ -33,9 +33,8 @@ def keep_freed_memory() -> None:
 def has_fast_bfloat16(device: str) -> bool:
     """Whether the device multiplies bfloat16 matrices faster than float32.
 
-    A processor does with tile registers (AMX); with AVX-512's bfloat16 instructions a step takes 1.1 to 1.6 times as
-    long as in float32 (docs/benchmarks/field.md).
+    A processor does with AVX-512's bfloat16 instructions or with tile registers, AMX (docs/benchmarks/field.md).
     """
     if device.startswith("cuda"):
         return torch.cuda.is_bf16_supported()
-    return torch.cpu._is_amx_tile_supported()
+    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()

@@ -235,7 +235,7 @@ def random_network(widths: tuple[int, ...], seed: int = 0) -> SubFieldMlp:
 
 
 def test_gradients_of_networks_agree_with_finite_differences(monkeypatch):
-    monkeypatch.setattr("presight_core.field.mlp.BLOCK_ROWS", 2)  # blocks of one and of two rows
+    monkeypatch.setattr("presight_core.field.mlp.BLOCK_BYTES", 2 * 64 * 8)  # blocks of one and of two rows
     network = random_network((3, 4, 4, 2))
     inputs = torch.randn(5, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64, requires_grad=True)
     assignment = Assignment(torch.tensor([0, 2, 5]))
@@ -250,7 +250,7 @@ def test_networks_equal_plain_layers_whatever_the_block(monkeypatch):
     network = random_network((3, 8, 2))
     inputs = torch.randn(50, 3, dtype=torch.float64)
     whole = network(inputs, Assignment(torch.tensor([0, 20, 50])))
-    monkeypatch.setattr("presight_core.field.mlp.BLOCK_ROWS", 7)
+    monkeypatch.setattr("presight_core.field.mlp.BLOCK_BYTES", 7 * 64 * 8)  # seven rows
     torch.testing.assert_close(network(inputs, Assignment(torch.tensor([0, 20, 50]))), whole)
     weights, biases = [weight[1] for weight in network.weights], [bias[1] for bias in network.biases]
     plain = torch.relu(inputs[20:] @ weights[0].T + biases[0]) @ weights[1].T + biases[1]
@@ -356,8 +356,27 @@ def test_following_rays_to_their_end_gives_the_weights_of_all_samples_in_front()
     assert not found[0, 20:].any()
 
 
-@pytest.mark.parametrize("has_tiles", [True, False])
-def test_a_processor_calculates_in_bfloat16_only_if_it_has_tile_registers(monkeypatch, has_tiles):
-    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+@pytest.mark.parametrize(("has_products", "has_tiles"), [(False, False), (True, False), (True, True)])
+def test_a_processor_calculates_in_bfloat16_only_if_it_has_instructions_for_it(monkeypatch, has_products, has_tiles):
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: has_products)
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: has_tiles)
-    assert threads.has_fast_bfloat16("cpu") is has_tiles
+    assert threads.has_fast_bfloat16("cpu") is has_products
+
+
+@pytest.mark.parametrize("rows", [1, 700])
+def test_half_precision_networks_cut_what_is_negative_and_keep_what_is_no_number(rows):
+    network = SubFieldMlp(1, (1, 3, 3))
+    network.dtype = torch.bfloat16
+    with torch.no_grad():
+        network.weights[0].copy_(torch.tensor([[[1.0], [-1.0], [torch.nan]]]))
+        network.weights[1].copy_(torch.eye(3)[None])
+        network.biases[0].zero_()
+        network.biases[1].zero_()
+    inputs = torch.full((rows, 1), 2.0, requires_grad=True)
+    outputs = network(inputs, Assignment(torch.tensor([0, rows]))).float()
+    assert outputs.isnan().all()
+    network.weights[0].data[0, 2] = -5.0
+    outputs = network(inputs, Assignment(torch.tensor([0, rows]))).float()
+    assert outputs.tolist() == [[2.0, 0.0, 0.0]] * rows
+    outputs.sum().backward()
+    assert inputs.grad.tolist() == [[1.0]] * rows
