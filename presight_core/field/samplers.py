@@ -6,9 +6,13 @@ Places along a ray have two scales: metres from the origin, and `s`, which runs 
 
 from dataclasses import dataclass
 
+import numba
 import torch
 from jaxtyping import Float
+from numba import prange
 from torch import Tensor
+
+LEAST_WEIGHT = 1e-5  # in all, on a ray: what lacks is spread evenly, so that an empty ray without padding is uniform
 
 
 @dataclass(frozen=True)
@@ -76,15 +80,22 @@ def resample(
     Inverse-transform sampling at equally spaced quantiles; `padding` is added to every weight first, so
     that no stretch of the ray goes without samples. Without `jitter` each quantile is the middle of its share.
     """
-    padded = weights.detach() + padding
+    offset = torch.full_like(edges[:, :1], 0.5) if jitter is None else jitter
+    way = _in_one_pass if edges.device.type == "cpu" else _in_passes
+    return way(edges, weights.detach(), sample_count, offset, padding)
+
+
+def _in_passes(edges: Tensor, weights: Tensor, sample_count: int, offset: Tensor, padding: float) -> Tensor:
+    """`resample`, one operator after the other."""
+    padded = weights + padding
     total = padded.sum(-1, keepdim=True)
-    lacking = torch.relu(1e-5 - total)  # an all-zero ray without padding becomes uniform
+    lacking = torch.relu(LEAST_WEIGHT - total)
     density = (padded + lacking / padded.shape[-1]) / (total + lacking)
     reached = torch.cat([torch.zeros_like(density[:, :1]), density.cumsum(-1).clamp_max(1)], -1)
-    share = 1 / (sample_count + 1)
-    quantiles = torch.arange(sample_count + 1, dtype=weights.dtype, device=weights.device) * share
-    quantiles = quantiles + (share / 2 if jitter is None else jitter * share)
-    return _interpolate(quantiles.expand(len(edges), -1).contiguous(), reached, edges)
+    quantiles = (torch.arange(sample_count + 1, dtype=weights.dtype, device=weights.device) + offset) / (
+        sample_count + 1
+    )
+    return _interpolate(quantiles, reached, edges)
 
 
 def _interpolate(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
@@ -94,3 +105,31 @@ def _interpolate(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
     share = ((at - low) / (high - low).clamp_min(1e-12)).clamp(0, 1)
     first, last = values.gather(-1, above - 1), values.gather(-1, above)
     return first + share * (last - first)
+
+
+def _in_one_pass(edges: Tensor, weights: Tensor, sample_count: int, offset: Tensor, padding: float) -> Tensor:
+    """`resample`, ray by ray."""
+    result = edges.new_empty(len(edges), sample_count + 1)
+    known, heavy, start = (tensor.contiguous().numpy() for tensor in (edges, weights, offset))
+    _resample_rays(known, heavy, start, padding, result.numpy())
+    return result
+
+
+@numba.njit(parallel=True, error_model="numpy", cache=True)
+def _resample_rays(edges, weights, offset, padding, result):
+    """Fill the new edges; a quantile after the other, each looks for its bin from where the one before it was."""
+    bins, count = weights.shape[1], result.shape[1]
+    for ray in prange(len(edges)):
+        total = bins * padding
+        for i in range(bins):
+            total += weights[ray, i]
+        lacking = max(LEAST_WEIGHT - total, 0.0)
+        scale, extra = 1 / (total + lacking), padding + lacking / bins
+        bin, below, above = 0, 0.0, (weights[ray, 0] + extra) * scale
+        for n in range(count):
+            quantile = (n + offset[ray, 0]) / count
+            while above <= quantile and bin < bins - 1:
+                bin += 1
+                below, above = above, above + (weights[ray, bin] + extra) * scale
+            share = min(max((quantile - below) / max(above - below, 1e-12), 0.0), 1.0)
+            result[ray, n] = edges[ray, bin] + share * (edges[ray, bin + 1] - edges[ray, bin])

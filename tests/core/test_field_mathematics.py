@@ -54,6 +54,18 @@ def test_a_ray_ends_at_the_floor_and_only_there():
     assert far[1:].flatten().tolist() == [1000.0, 1000.0]
 
 
+@pytest.mark.parametrize("padding", [0.0, 0.01])
+@pytest.mark.parametrize("has_jitter", [True, False])
+def test_samples_are_placed_alike_ray_by_ray_and_operator_by_operator(padding, has_jitter):
+    edges, _ = torch.rand(40, 33, dtype=torch.float64).sort()
+    weights = torch.rand(40, 32, dtype=torch.float64) ** 8
+    weights[:4] = 0
+    offset = torch.rand(40, 1, dtype=torch.float64) if has_jitter else torch.full((40, 1), 0.5, dtype=torch.float64)
+    found = samplers.resample(edges, weights, 16, offset if has_jitter else None, padding)
+    torch.testing.assert_close(found, samplers._in_passes(edges, weights, 16, offset, padding))
+    assert (found.diff() >= 0).all()
+
+
 def test_no_ray_ends_beyond_the_far_plane():
     directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     far = samplers.far_above_floor(directions, far_m=100.0, floor_m=4.0, slope=0.1)
