@@ -1,8 +1,10 @@
 """How fast surfaces are found, beside the forward pass of training: `python bench/extraction.py FIELD`.
 
-FIELD is the folder of a trained field (`field/` in a tile's scratch folder). Random rays from its cameras' boxes near
-the horizon; the two take turns, one thread. With `--points N` the sums of N surface points spread over a square
-kilometre are made instead, and the peak memory of the process is printed as they grow.
+FIELD is the folder of a trained field (`field/` in a tile's scratch folder). Both see what they see at work, from
+places in its cameras' boxes: training random rays near the horizon, extraction every fourth pixel of images, some at a
+time, without features: the presets for CPUs take those of images. The two take turns, one thread. With `--points N`
+the sums of N surface points spread over a square kilometre are made instead, and the peak memory of the process is
+printed as they grow.
 """
 
 import argparse
@@ -25,6 +27,9 @@ from presight_core.grid import Lattice
 from stages.voxel_sums import Samples, VoxelSums
 
 RAYS = 8192
+IMAGES = 3  # at a time: stages.extraction.RAYS_TOGETHER
+IMAGE_PX = 100, 41  # every fourth pixel of 400 x 225, less the sky
+HALF_VIEW = 0.7  # tangent of half the angle of view: 70 degrees
 CHANNELS = 64
 SIDE_M = 1000.0
 POINTS_OF_FRAME = 20_000
@@ -49,7 +54,9 @@ def main() -> None:
 
 def speed(field: TileField, rounds: int) -> dict[str, float]:
     """Rays a processor second of training's forward pass, gradients recorded, and of the surfaces."""
-    origins, directions = random_rays(field)
+    random = np.random.default_rng(0)
+    origins, directions = random_rays(field, random)
+    images = [np.concatenate(rays) for rays in zip(*(image_rays(field, random) for _ in range(IMAGES)), strict=True)]
     numbers, passes = np.zeros(RAYS, np.int64), len(field.proposals) + 1
     rates: dict[str, list[float]] = {"forward": [], "first-hit": [], "expected": []}
     for _ in range(rounds + 1):
@@ -59,25 +66,41 @@ def speed(field: TileField, rounds: int) -> dict[str, float]:
         del seen
         for rule in ("first-hit", "expected"):
             started = time.process_time()
-            find_surface(field, origins, directions, rule)
-            rates[rule].append(RAYS / (time.process_time() - started))
+            find_surface(field, *images, rule, with_features=False)
+            rates[rule].append(len(images[0]) / (time.process_time() - started))
     medians = {f"{name}_rays_per_s": statistics.median(values[1:]) for name, values in rates.items()}
     ratios = [surface / forward for surface, forward in zip(rates["first-hit"], rates["forward"], strict=True)]
     return {**medians, "first_hit_over_forward": statistics.median(ratios[1:])}
 
 
-def random_rays(field: TileField) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rays from random places at camera height inside the sub-fields' boxes."""
-    random, parts = np.random.default_rng(0), field.shape.sub_fields
+def random_rays(field: TileField, random: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rays from random places, in random directions near the horizon."""
+    directions = random.normal(size=(RAYS, 3)) * (1, 1, 0.15) - (0, 0, 0.1)
+    return random_places(field, random, RAYS), directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def image_rays(field: TileField, random: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rays of the lower half of an image and a little more, row by row: extraction leaves out the sky."""
+    columns, rows = IMAGE_PX
+    across, down = np.meshgrid(np.linspace(-1, 1, columns) * HALF_VIEW, np.linspace(-0.2, 1, rows) * HALF_VIEW / 2)
+    yaw_rad = random.uniform(0, 2 * np.pi)
+    ahead, right = np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0]), np.array([np.sin(yaw_rad), -np.cos(yaw_rad), 0])
+    directions = ahead + across.reshape(-1, 1) * right - down.reshape(-1, 1) * [0, 0, 1]
+    origins = np.broadcast_to(random_places(field, random, 1), directions.shape)
+    return origins, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def random_places(field: TileField, random: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Places (count, 3) at camera height inside the sub-fields' boxes."""
+    parts = field.shape.sub_fields
     centroids = np.array([part.centroid_m for part in parts])
     low, high = (np.array([getattr(part, name) for part in parts]) for name in ("box_min_m", "box_max_m"))
     margin = np.array([15.0, 15.0, 0])  # of a box around its cameras
-    chosen = random.integers(len(parts), size=RAYS)
+    chosen = random.integers(len(parts), size=count)
     low, high = np.minimum(low + margin, centroids - 1), np.maximum(high - margin, centroids + 1)
-    origins = random.uniform(low[chosen], high[chosen])
-    origins[:, 2] = centroids[chosen, 2]
-    directions = random.normal(size=(RAYS, 3)) * (1, 1, 0.15) - (0, 0, 0.1)
-    return origins, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    places = random.uniform(low[chosen], high[chosen])
+    places[:, 2] = centroids[chosen, 2]
+    return places
 
 
 def memory(point_count: int) -> dict[str, float]:

@@ -27,6 +27,8 @@ from stages.observed_columns import ObservedColumns
 from stages.training import holdout_mask
 from stages.voxel_sums import CELLS, SUPERBLOCK, Samples, Superblock, VoxelSums
 
+RAYS_TOGETHER = 12_000  # are followed at a time, at least: fewer take longer, each
+
 
 @dataclass(frozen=True)
 class TileExtraction:
@@ -85,9 +87,8 @@ def extract_tile(
     heights = CameraHeights(job.frames.positions)
     counts: Counter[str] = Counter()
     rows = chosen_rows(job)
-    for done, row in enumerate(rows, 1):
-        rays = _rays(job, row, source, counts)
-        rays, surface = _meet_surfaces(job, field, rays, counts)
+    followed = _followed(job, field, rows, source, counts)
+    for done, (row, rays, surface) in enumerate(followed, 1):
         kept = _filtered(job, surface, heights, counts)
         columns.add(rays.origin, _seen_ends(job, rays, surface, kept, heights))
         samples = Samples(surface.points_world, surface.features, surface.rgb, surface.density).select(kept)
@@ -127,12 +128,34 @@ def _rays(job: TileExtraction, row: int, source: PixelSource, counts: Counter[st
     return Rays(*camera.rays(followed), image.features[cell_of(followed, size_px, image.features.shape)])
 
 
-def _meet_surfaces(
-    job: TileExtraction, field: TileField, rays: Rays, counts: Counter[str]
-) -> tuple[Rays, SurfacePoints]:
+def _followed(
+    job: TileExtraction, field: TileField, rows: list[int], source: PixelSource, counts: Counter[str]
+) -> Iterator[tuple[int, Rays, SurfacePoints]]:
+    """Each row with its rays that meet a surface, and those surfaces. The field is asked for some rows at a time."""
+    waiting: list[tuple[int, Rays]] = []
+    for row in rows:
+        waiting.append((row, _rays(job, row, source, counts)))
+        if sum(len(rays.directions) for _, rays in waiting) >= RAYS_TOGETHER or row == rows[-1]:
+            for (each, rays), surface in zip(
+                waiting, _surfaces(job, field, [rays for _, rays in waiting]), strict=True
+            ):
+                yield each, *_found(job, rays, surface, counts)
+            waiting.clear()
+
+
+def _surfaces(job: TileExtraction, field: TileField, frames: list[Rays]) -> Iterator[SurfacePoints]:
+    """What the rays of each frame meet."""
+    settings = job.settings.extraction
+    origins = np.concatenate([np.broadcast_to(rays.origin, rays.directions.shape) for rays in frames])
+    directions = np.concatenate([rays.directions for rays in frames])
+    surface = find_surface(field, origins, directions, settings.surface, settings.features == "field")
+    ends = np.cumsum([len(rays.directions) for rays in frames])
+    for first, last in zip([0, *ends], ends, strict=False):
+        yield SurfacePoints(**{column.name: getattr(surface, column.name)[first:last] for column in fields(surface)})
+
+
+def _found(job: TileExtraction, rays: Rays, surface: SurfacePoints, counts: Counter[str]) -> tuple[Rays, SurfacePoints]:
     """The rays that meet a surface whose values are numbers, and those surfaces."""
-    origins = np.broadcast_to(rays.origin, rays.directions.shape)
-    surface = find_surface(field, origins, rays.directions, job.settings.extraction.surface)
     channels, of_images = surface.features.shape[-1], job.settings.extraction.features == "images"
     if channels != job.feature_channels and not of_images:
         raise InputError(f"the field has {channels} channels, the feature space {job.feature_channels}; train it anew")

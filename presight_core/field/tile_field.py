@@ -250,8 +250,10 @@ class TileField(nn.Module):
             edges = samplers.resample(edges, flattened, count, jitter[number], self.shape.sampling.padding)
         return tuple(histograms), edges
 
-    def query(self, points: Float[Tensor, "rays samples 3"], conditions: Float[Tensor, "rays _"]) -> PointValues:
-        """Density, colour and features at points of rays, with each ray's `conditions`."""
+    def query(
+        self, points: Float[Tensor, "rays samples 3"], conditions: Float[Tensor, "rays _"], with_features: bool = True
+    ) -> PointValues:
+        """Density, colour and features (of no channel, if they are not wanted) at points, with rays' `conditions`."""
         ray_count, sample_count, _ = points.shape
         assignment, positions, inside = self._locate(points)
         geometry = self.shape.settings.geometry_channels
@@ -261,7 +263,7 @@ class TileField(nn.Module):
         of_rays = conditions.to(density.dtype).repeat_interleave(sample_count, 0)
         seen = torch.cat([geometry_values, assignment.sort(of_rays)], -1)
         rgb = torch.sigmoid(self.colour(seen, assignment).float())
-        features = self.semantics(torch.relu(hidden), assignment)
+        features = self.semantics(torch.relu(hidden), assignment) if with_features else hidden[:, :0]
         shape = ray_count, sample_count
         return PointValues(
             assignment.restore(self._activate(density[:, 0], inside)).view(shape),

@@ -3,7 +3,6 @@
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -86,7 +85,9 @@ def frame_of(upper: int, lower: int) -> FramePixels:
     return FramePixels(np.zeros((1, 1, 3), np.uint8), labels, np.zeros((1, 1, CHANNELS), np.uint8))
 
 
-def street_surface(_field, origins: np.ndarray, directions: np.ndarray, surface: str) -> SimpleNamespace:
+def street_surface(
+    _field, origins: np.ndarray, directions: np.ndarray, surface: str, with_features: bool = True
+) -> extraction.SurfacePoints:
     """Where rays meet the ground, or the wall to the left below its roof; what stands behind is never seen."""
     assert surface == "first-hit"
     with np.errstate(divide="ignore"):
@@ -102,7 +103,7 @@ def street_surface(_field, origins: np.ndarray, directions: np.ndarray, surface:
         found,
         np.where(found, depth, 1.0).astype(np.float32),
         points,
-        features.astype(np.float32),
+        features.astype(np.float32) if with_features else np.zeros((len(points), 0), np.float32),
         np.full((len(points), 3), 0.2, np.float32),
         np.where(points[:, 0] > THIN_M, 0.01, 3.0).astype(np.float32),
     )
