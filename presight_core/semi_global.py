@@ -43,9 +43,9 @@ def best_places(
 
 @numba.njit(fastmath=True, cache=True)
 def _add_paths(scores, planes, labels, nearness, costs):
-    """Add what the cheapest path from each side costs that ends in a cell at a depth."""
-    rows, columns, _ = scores.shape
-    path, least = np.empty_like(scores), np.empty((rows, columns), np.float32)
+    """Add what the cheapest path from each side costs that ends in a cell at a depth, more than at the best depth."""
+    rows, columns, depths = scores.shape
+    path, beside = np.empty_like(scores), np.empty(depths, np.float32)
     for down, right in PATHS:
         for i in range(rows):
             row = i if down >= 0 else rows - 1 - i
@@ -56,8 +56,9 @@ def _add_paths(scores, planes, labels, nearness, costs):
                 if 0 <= before[0] < rows and 0 <= before[1] < columns and planes[before].any():
                     ratio = _ratio(planes[row, column], row, column, before)
                     share = np.float32(1) if labels[before] == labels[row, column] else AT_BORDERS
-                    _go_on(path[before], least[before], ratio, share, nearness, own)
-                least[row, column] = own.min()
+                    _fill_beside(path[before], beside)
+                    _go_on(path[before], beside, ratio, share, nearness, own)
+                own -= own.min()
         costs += path
 
 
@@ -71,16 +72,42 @@ def _ratio(plane, row, column, before):
 
 
 @numba.njit(fastmath=True)
-def _go_on(before, least, ratio, share, nearness, own):
+def _fill_beside(path, beside):
+    """Fill, for each place between two depths, what is least of those and of the ones next to them."""
+    last = len(path) - 1
+    for i in range(1, last - 1):
+        beside[i] = min(path[i - 1], path[i], path[i + 1], path[i + 2])
+    beside[0] = min(path[0], path[1], path[min(2, last)])
+    beside[last - 1] = min(path[max(last - 2, 0)], path[last - 1], path[last])
+
+
+@numba.njit(fastmath=True)
+def _go_on(before, beside, ratio, share, nearness, own):
     """Add to each depth's own cost the cheapest way to it from the cell before; `share` of the costs of leaving."""
     last = len(before) - 1
-    first, step = nearness[0], nearness[1] - nearness[0]
-    start = first * (ratio - 1) / step  # where the first depth lies in the cell before, if the plane goes on
-    for depth in range(len(own)):
-        place, cheapest = start + depth * ratio, least + share * LEAP_COST
-        if 0 <= place <= last:
-            low = min(int(place), last - 1)
-            here, there = before[low], before[low + 1]
-            beside = min(here, there, before[max(low - 1, 0)], before[min(low + 2, last)]) + share * STEP_COST
-            cheapest = min(cheapest, here + (place - low) * (there - here), beside)
-        own[depth] += cheapest - least
+    step, leap, drift = share * STEP_COST, share * LEAP_COST, ratio - np.float32(1)
+    start = nearness[0] * drift / (nearness[1] - nearness[0])  # where the first depth lies in the cell before
+    depth = 0
+    while depth <= last:
+        place = start + depth * ratio
+        if place < 0 or place > last:  # nothing there to go on from
+            own[depth] += leap
+            depth += 1
+            continue
+        low = min(int(place), last - 1)
+        fraction = place - low
+        # The depths from here on that lie as many places from theirs: vector instructions take them together.
+        left = (1 - fraction) / drift if drift > 0 else (fraction / -drift if drift < 0 else np.float32(last))
+        end = depth + max(1, min(int(left), last + 1 - depth, last - low))
+        there = low + end - depth
+        _add_cheapest(before[low : there + 1], beside[low:there], fraction, drift, (step, leap), own[depth:end])
+        depth = end
+
+
+@numba.njit(fastmath=True)
+def _add_cheapest(before, beside, fraction, drift, costs, own):
+    """`_go_on` for depths each between one of `before` and the next: `fraction` of the way, and ever `drift` more."""
+    step, leap = costs
+    for i in range(len(own)):
+        straight = before[i] + (fraction + np.float32(i) * drift) * (before[i + 1] - before[i])
+        own[i] += min(straight, beside[i] + step, leap)
