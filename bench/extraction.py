@@ -27,7 +27,7 @@ from presight_core.grid import Lattice
 from stages.voxel_sums import Samples, VoxelSums
 
 RAYS = 8192
-IMAGES = 3  # at a time: stages.extraction.RAYS_TOGETHER
+IMAGES = 6  # at a time: stages.extraction.RAYS_TOGETHER
 IMAGE_PX = 100, 41  # every fourth pixel of 400 x 225, less the sky
 HALF_VIEW = 0.7  # tangent of half the angle of view: 70 degrees
 CHANNELS = 64

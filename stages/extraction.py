@@ -27,7 +27,7 @@ from stages.observed_columns import ObservedColumns
 from stages.training import holdout_mask
 from stages.voxel_sums import CELLS, SUPERBLOCK, Samples, Superblock, VoxelSums
 
-RAYS_TOGETHER = 12_000  # are followed at a time, at least: fewer take longer, each
+RAYS_TOGETHER = 24_000  # are followed at a time, at least: fewer take longer, each
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from presight_core.field.tile_field import Sampling, TileField
 
 UNSEEN = 1e-3  # share of a ray that is not followed further: at most 1 m of an expected depth, if it went on to 1,000 m
 HIT = 0.49  # likewise for the first hit, which is where one half is left; the hundredth is for rounding
-CHUNK_RAYS = 16384  # a call costs as much as some 600 rays; at 128 samples activations stay near 200 MB
+CHUNK_RAYS = 32768  # a call costs as much as some 600 rays
 
 
 @dataclass(frozen=True)

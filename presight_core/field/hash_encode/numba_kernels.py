@@ -15,7 +15,7 @@ from numba import prange, types
 from numba.extending import intrinsic
 
 BLOCK = 64  # points; index and weight arrays of a block, 4 KiB, stay in the first-level cache
-PREFETCHED_VALUES = 1 << 20  # 4 MiB: smaller tables stay in a second-level cache, where asking first costs time
+PREFETCHED_VALUES = 1 << 18  # 1 MiB: smaller tables stay in a second-level cache, where asking first costs time
 PRIME_Y = np.uint32(2654435761)  # Instant-NGP, equation 4
 PRIME_Z = np.uint32(805459861)
 VECTOR = ir.VectorType(ir.FloatType(), 4)
