@@ -120,7 +120,7 @@ class GroundSettings(Settings):
 class StereoSettings(Settings):
     """How far surfaces are, from neighbouring images alone, before training (`stages/stereo.py`). Not of the paper."""
 
-    weight: Annotated[float, Field(ge=0)] = 0.0  # of the loss; 0: nothing is known, as in the paper
+    weight: Annotated[float, Field(ge=0)] = 0.0  # of the loss at first; 0: nothing is known, as in the paper
     tolerance: Share = 0.015  # of the distance: rays end within it
     width_px: Count = 400  # at which images are compared
 

@@ -228,6 +228,7 @@ class Run:
             group["lr"] = schedule.learning_rate(step, self._settings)
         jitter = self._random(step, len(batch.rows), self.passes)
         exponent, trains_proposals = self._schedule(step)
+        stereo_weight = schedule.stereo_weight(step, self._settings)
         targets = Targets(
             *(torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.labels, batch.features))
         )
@@ -239,9 +240,9 @@ class Run:
             features_shape=self._settings.features_shape,
         )
         if self._ground is None:
-            return self._descend(self._rays(batch), targets, sampling)
+            return self._descend(self._rays(batch), targets, sampling, stereo_weight)
         start_m, end_m = (torch.from_numpy(value).to(self._job.device) for value in self._ground.stretches(batch))
-        return self._descend(replace(self._rays(batch), ends_m=end_m), targets, sampling, start_m)
+        return self._descend(replace(self._rays(batch), ends_m=end_m), targets, sampling, stereo_weight, start_m)
 
     @property
     def passes(self) -> int:
@@ -259,7 +260,12 @@ class Run:
         return schedule.anneal_exponent(step, self._settings), schedule.trains_proposals(step, self._settings)
 
     def _descend(
-        self, rays: Rays, targets: Targets, sampling: Sampling, starts_m: Tensor | None = None
+        self,
+        rays: Rays,
+        targets: Targets,
+        sampling: Sampling,
+        stereo_weight: float | Tensor,
+        starts_m: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """One step of the optimiser; its losses by name. On a card nothing here may wait for it: see CardRun.
 
@@ -272,9 +278,9 @@ class Run:
             ground = losses.ground_loss(rendering.field.weights, middles_m, starts_m)
             parts["ground"] = self._settings.ground.weight * ground
         if self._depths is not None:
-            stereo, depth_m = self._settings.stereo, self._depths.along(rays)
-            loss = losses.stereo_loss(rendering.field.weights, rendering.edges_m, depth_m, stereo.tolerance)
-            parts["stereo"] = stereo.weight * loss
+            known = self._depths.along(rays), self._settings.stereo.tolerance
+            loss = losses.stereo_loss(rendering.field.weights, rendering.edges_m, *known)
+            parts["stereo"] = stereo_weight * loss
         torch.stack(list(parts.values())).sum().backward()
         self._optimiser.step()
         self._optimiser.zero_grad()

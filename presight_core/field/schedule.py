@@ -20,6 +20,14 @@ def anneal_exponent(step: int, settings: TrainingSettings) -> float:
     return ANNEAL_SLOPE * progress / ((ANNEAL_SLOPE - 1) * progress + 1)
 
 
+def stereo_weight(step: int, settings: TrainingSettings) -> float:
+    """Weight of the depths that neighbouring images tell: it falls evenly to 0.
+
+    They say where surfaces are; thin things, edges and the one in ten that is wrong are left to colours.
+    """
+    return settings.stereo.weight * (1 - step / settings.steps)
+
+
 def trains_proposals(step: int, settings: TrainingSettings) -> bool:
     """Whether the proposals learn in this step: always during the warm-up, then now and again."""
     return step < settings.warmup * settings.steps or step % PROPOSAL_STRIDE == 0

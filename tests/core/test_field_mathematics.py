@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from presight_core.config import TrainingSettings
+from presight_core.config import StereoSettings, TrainingSettings
 from presight_core.field import losses, rendering, samplers, schedule, threads
 from presight_core.field.assignment import Assignment, assign
 from presight_core.field.contraction import contract, grid_position, grid_positions
@@ -220,6 +220,12 @@ def test_annealing_ends_at_one():
     assert exponents[0] == 0
     assert exponents == sorted(exponents)
     assert exponents[-1] == 1
+
+
+def test_what_neighbouring_images_tell_weighs_less_and_less():
+    settings = TrainingSettings(steps=100, stereo=StereoSettings(weight=0.03))
+    weights = [schedule.stereo_weight(step, settings) for step in (0, 50, 100)]
+    assert weights == pytest.approx([0.03, 0.015, 0])
 
 
 def test_points_go_to_the_nearest_centroid_and_back_in_order():
