@@ -15,7 +15,7 @@ from typing import Any
 from train_step import CHANNELS, WARM_UP, random_batch, street
 
 from presight_core.config import load_city_settings
-from presight_core.field import hash_encode, mlp, rendering, samplers, threads
+from presight_core.field import hash_encode, mlp, ray_density, rendering, samplers, threads
 from presight_core.field.tile_field import TileField
 from stages.tiling import sub_fields
 from stages.training import Run, TileTraining
@@ -23,6 +23,7 @@ from stages.training import Run, TileTraining
 PARTS = (
     ("encode", hash_encode.numba_kernels, "encode"),
     ("encode, gradient", hash_encode.numba_kernels, "table_gradient"),
+    ("proposals that do not learn, in one pass", ray_density, "ray_density"),
     ("networks", mlp._BlockwiseLayers, "forward"),
     ("networks, gradient", mlp._BlockwiseLayers, "backward"),
     ("positions and sub-fields", TileField, "_locate"),
@@ -62,8 +63,8 @@ def main() -> None:
     whole = seconds.pop("whole step")
     seconds["rest"] = whole - sum(seconds.values())
     for part, spent in sorted(seconds.items(), key=lambda item: -item[1]):
-        print(f"{part:26} {spent / options.steps * 1000:7.1f} ms {spent / whole:6.1%}")
-    print(f"{'whole step':26} {whole / options.steps * 1000:7.1f} ms")
+        print(f"{part:40} {spent / options.steps * 1000:7.1f} ms {spent / whole:6.1%}")
+    print(f"{'whole step':40} {whole / options.steps * 1000:7.1f} ms")
 
 
 def watch(seconds: dict[str, float], part: str, owner: Any, name: str) -> None:

@@ -142,7 +142,7 @@ class TrainingSettings(Settings):
     image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     keyframes_only: bool = False
     holdout_every: Annotated[int, Field(ge=0)] = 8  # every 8th frame of a camera is kept for evaluation; 0: none
-    bfloat16: bool = True  # multilayer perceptrons, where the device is faster with it: cards, CPUs with AMX
+    bfloat16: bool = True  # multilayer perceptrons, where the device is faster with it (threads.has_fast_bfloat16)
     checkpoint_every: Count = 2000
     seed: int = 0
     loss: LossSettings = LossSettings()
