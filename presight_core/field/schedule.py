@@ -21,11 +21,12 @@ def anneal_exponent(step: int, settings: TrainingSettings) -> float:
 
 
 def stereo_weight(step: int, settings: TrainingSettings) -> float:
-    """Weight of the depths that neighbouring images tell: it falls evenly to 0.
+    """Weight of the depths that neighbouring images tell: whole at first, then it falls evenly to 0.
 
     They say where surfaces are; thin things, edges and the one in ten that is wrong are left to colours.
     """
-    return settings.stereo.weight * (1 - step / settings.steps)
+    fading_steps = max(settings.steps - settings.stereo.fades_from, 1)
+    return settings.stereo.weight * min(1.0, (settings.steps - step) / fading_steps)
 
 
 def trains_proposals(step: int, settings: TrainingSettings) -> bool:
