@@ -3,7 +3,7 @@
 import shutil
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -151,7 +151,7 @@ def _surfaces(job: TileExtraction, field: TileField, frames: list[Rays]) -> Iter
     surface = find_surface(field, origins, directions, settings.surface, settings.features == "field")
     ends = np.cumsum([len(rays.directions) for rays in frames])
     for first, last in zip([0, *ends], ends, strict=False):
-        yield SurfacePoints(**{column.name: getattr(surface, column.name)[first:last] for column in fields(surface)})
+        yield surface.select(slice(first, last))
 
 
 def _found(job: TileExtraction, rays: Rays, surface: SurfacePoints, counts: Counter[str]) -> tuple[Rays, SurfacePoints]:
@@ -162,10 +162,8 @@ def _found(job: TileExtraction, rays: Rays, surface: SurfacePoints, counts: Coun
     values = np.concatenate([surface.points_world, surface.features, surface.rgb, surface.density[:, None]], -1)
     found = surface.found & np.isfinite(values).all(-1)
     counts["no_surface"] += int((~found).sum())
-    columns = {column.name: getattr(surface, column.name)[found] for column in fields(SurfacePoints)}
-    if of_images:
-        columns["features"] = rays.features[found] / np.float32(255)
-    return Rays(rays.origin, rays.directions[found], rays.features[found]), SurfacePoints(**columns)
+    rays, surface = Rays(rays.origin, rays.directions[found], rays.features[found]), surface.select(found)
+    return rays, replace(surface, features=rays.features / np.float32(255)) if of_images else surface
 
 
 def _filtered(

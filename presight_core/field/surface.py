@@ -28,6 +28,10 @@ class SurfacePoints:
     rgb: NDArray[np.float32]  # (R, 3) in [0, 1], at the mean of all embeddings
     density: NDArray[np.float32]  # (R,) per metre, mean of the field and its proposals
 
+    def select(self, chosen: NDArray[np.bool_] | slice) -> "SurfacePoints":
+        """Some of the rays."""
+        return SurfacePoints(**{column.name: getattr(self, column.name)[chosen] for column in fields(self)})
+
 
 def find_surface(
     field: TileField,
