@@ -209,8 +209,11 @@ def voxel_figures(tile: Tile, field: TileField, picture: Path) -> dict[str, Any]
         for least in DENSITIES
         for dense in (density > least,)
     }
-    best = true_voxels(tile)
-    figures["ceiling"] = scores(best, tile.surface.distance_m(best), seen, labels)
+    figures["ceiling_of_hits"] = {
+        hits: scores(best, tile.surface.distance_m(best), seen, labels)
+        for hits in (1, tile.job.settings.extraction.min_hits)
+        for best in (true_voxels(tile, hits),)
+    }
     return figures
 
 
@@ -272,13 +275,13 @@ def seen_surface(tile: Tile) -> tuple[NDArray, NDArray]:
     return points[first], labels[first]
 
 
-def true_voxels(tile: Tile) -> NDArray[np.float64]:
-    """Centroids (N, 3) that extraction would find if the field's depth were true."""
+def true_voxels(tile: Tile, min_hits: int) -> NDArray[np.float64]:
+    """Centroids (N, 3) of what extraction would find if the field's depth were true, with at least so many hits."""
     settings = tile.job.settings.extraction
     points, _ = true_points(tile, chosen_rows(tile.extraction), settings.pixel_stride)
     _, inverse, hits = np.unique(Lattice().voxel_of(points), axis=0, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(inverse.ravel(), axis) for axis in points.T], -1)
-    return (sums / hits[:, None])[hits >= settings.min_hits]
+    return (sums / hits[:, None])[hits >= min_hits]
 
 
 def draw_voxels(points: NDArray, distance_m: NDArray, file: Path) -> None:

@@ -135,6 +135,7 @@ class TrainingSettings(Settings):
     warmup: Share = 0.1  # share of the steps with rising learning rate
     decay_at: tuple[Share, ...] = (0.25, 0.5, 0.75)
     decay: Share = 0.33
+    beta2: Annotated[float, Field(gt=0, lt=1)] = 0.999  # of AdamW; Instant-NGP: 0.99
     weight_decay: float = 1e-5  # not on hash tables
     anneal: Share = 0.1  # share of the steps over which proposal weights sharpen
     thin_weight: Annotated[float, Field(ge=1)] = 1.0  # how much likelier pixels of poles, signs and fences are drawn
@@ -164,6 +165,7 @@ class ExtractionSettings(Settings):
     above_camera_m: Metres = 6.0
     min_density: float = 0.05  # per metre; mean of the three networks (1.0 in the released code's scaled units)
     min_hits: Count = 2  # released code drops voxels with the minimum hit count
+    lone_density: Annotated[float, Field(ge=0)] = 0.0  # per metre: denser voxels need one hit only; 0: none does
 
 
 class ValidationSettings(Settings):

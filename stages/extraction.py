@@ -95,7 +95,7 @@ def extract_tile(
         sums.add(samples, job.drives.index(str(job.frames.drive_id[row])))
         report(Progress("extraction", done, len(rows), {"points": counts["points"]}))
     columns.keep(job.owned)
-    counts["voxels"], counts["few_hits"] = sums.finish(settings.min_hits)
+    counts["voxels"], counts["few_hits"] = sums.finish(settings.min_hits, settings.lone_density)
     return ExtractionResult(voxel_batches(sums, columns), job.drives, dict(counts))
 
 

@@ -7,11 +7,12 @@ another image, looked at for itself, says the same of the place: nine in ten of 
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16
+from jaxtyping import Float, Float16, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -27,10 +28,12 @@ from stages.neighbours import Neighbours
 
 LEVEL = classes.lookup(("road", "sidewalk", "terrain"))  # patches of these lie flat, others face the camera at first
 NOWHERE = classes.lookup((*classes.DYNAMIC, "sky"))  # no ray of training wants to know where these are
+SLIM = classes.lookup(("pole", "traffic light", "traffic sign"))  # narrower than a cell, which may show what is behind
 SOURCES = 8  # images that an image is compared with
 JUDGES = 20  # images that are asked whether they found the same
 AGREEING = 1  # of the judges must have; with two, fields find less and are hardly purer
 MAX_DIFFERENCE = 0.04  # between depths that agree, a share; their mean is more exact than any of them
+AROUND = tuple(product((-1, 0, 1), repeat=2))  # rows and columns to the cells around, and its own
 KEPT_VIEWS = 512  # small images in memory, 50 MB: a drive's neighbours follow each other in time
 
 DepthMaps = Float16[NDArray, "images rows columns"]  # metres along the optical axis; 0 where nothing is known
@@ -77,15 +80,26 @@ class KnownDepths:
         ]
         self._maps = torch.from_numpy(maps).to(device)
         self._cell_from_world = torch.from_numpy(np.array(cell_from_world, np.float32)).to(device)
+        self._is_slim = torch.from_numpy(SLIM).to(device)
 
-    def along(self, rays: Rays) -> Float[Tensor, " rays"]:
-        """Metres along each ray; 0 where nothing is known."""
+    def along(self, rays: Rays, labels: UInt8[Tensor, " rays"]) -> Float[Tensor, "rays 2"]:
+        """Metres along each ray to where it ends, and to the nearest surface in its cell or those around; 0: unknown.
+
+        Beside an edge a cell shows both sides of it, and its depth is that of one. What is slim ends at the nearest.
+        """
         assert rays.images is not None, "rays of training come from images"
         x, y, along_axis = torch.einsum("nij,nj->in", self._cell_from_world[rays.images], rays.directions)
-        _, row_count, column_count = self._maps.shape
         row, column = (y / along_axis).long(), (x / along_axis).long()
-        depth_m = self._maps[rays.images, row.clamp(0, row_count - 1), column.clamp(0, column_count - 1)]
-        return depth_m / along_axis
+        around_m = torch.stack([self._at(rays.images, row + down, column + right) for down, right in AROUND])
+        nearest_m = torch.where(around_m > 0, around_m, torch.inf).amin(0)
+        nearest_m = torch.where(nearest_m < torch.inf, nearest_m, 0)
+        end_m = torch.where(self._is_slim[labels.long()], nearest_m, self._at(rays.images, row, column))
+        return torch.stack([end_m, nearest_m], -1) / along_axis[:, None]
+
+    def _at(self, images: Tensor, row: Tensor, column: Tensor) -> Tensor:
+        """Depths of cells, of those at the rim for cells beyond it."""
+        _, row_count, column_count = self._maps.shape
+        return self._maps[images, row.clamp(0, row_count - 1), column.clamp(0, column_count - 1)]
 
 
 class _Comparison:

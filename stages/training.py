@@ -216,7 +216,8 @@ class Run:
         others = [parameter for parameter in self.field.parameters() if not is_table[id(parameter)]]
         groups = [{"params": tables, "weight_decay": 0.0}, {"params": others}]
         # 1e-15 (Instant-NGP): a hash row's gradients are tiny and rare, the usual 1e-8 would swallow them.
-        self._optimiser = torch.optim.AdamW(groups, weight_decay=self._settings.weight_decay, eps=1e-15, fused=True)
+        betas, decay = (0.9, self._settings.beta2), self._settings.weight_decay
+        self._optimiser = torch.optim.AdamW(groups, betas=betas, weight_decay=decay, eps=1e-15, fused=True)
         self._generator = torch.Generator(job.device)
         ground = self._settings.ground
         self._ground = Ground(job.frames.positions, ground) if ground.weight else None
@@ -271,14 +272,16 @@ class Run:
 
         Where rays show the ground they must not end before `starts_m` (R,), metres; 0: nothing is known.
         """
+        if self._depths is not None:
+            sampling = replace(sampling, hints_m=self._depths.along(rays, targets.labels))
         rendering = self.field(rays, sampling)
         parts = self._losses(rendering, targets, sampling.train_proposals)
         if starts_m is not None:
             middles_m = (rendering.edges_m[:, 1:] + rendering.edges_m[:, :-1]) / 2
             ground = losses.ground_loss(rendering.field.weights, middles_m, starts_m)
             parts["ground"] = self._settings.ground.weight * ground
-        if self._depths is not None:
-            known = self._depths.along(rays), self._settings.stereo.tolerance
+        if sampling.hints_m is not None:
+            known = sampling.hints_m[:, 0], self._settings.stereo.tolerance
             loss = losses.stereo_loss(rendering.field.weights, rendering.edges_m, *known)
             parts["stereo"] = stereo_weight * loss
         torch.stack(list(parts.values())).sum().backward()

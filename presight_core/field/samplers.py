@@ -68,6 +68,13 @@ def uniform_edges(
     return lower + (upper - lower) * jitter
 
 
+def held(edges_m: Float[Tensor, "rays edges"], depths_m: Float[Tensor, "rays depths"]) -> Float[Tensor, "rays bins"]:
+    """How many of a ray's depths lie in each of its bins; those before the first edge, such as 0, in none."""
+    depths_m = depths_m[:, :, None]
+    is_held = (edges_m[:, None, :-1] <= depths_m) & (depths_m < edges_m[:, None, 1:])
+    return is_held.sum(1).to(edges_m)
+
+
 def resample(
     edges: Float[Tensor, "rays edges"],
     weights: Float[Tensor, "rays bins"],

@@ -26,6 +26,7 @@ from presight_core.field.spherical_harmonics import HARMONICS, spherical_harmoni
 from presight_core.tiles import SubField
 
 SKY_WIDTH = 32  # released code
+HINTED = 0.2  # that each depth of `Sampling.hints_m` adds to the weight, 1 in all at most, of the bin that holds it
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ class Sampling:
     left: float = 0.0  # a ray is followed until this share of it is left; the proposals' samples beyond weigh nothing
     fade_m: float = 0.0  # samples nearer to the camera than this learn less; see `fade_gradient`
     features_shape: bool = True  # False: density learns nothing from rendered features
+    hints_m: Float[Tensor, "rays depths"] | None = None  # where samples go whatever the proposals say; 0: nowhere
 
 
 @dataclass(frozen=True)
@@ -246,8 +248,10 @@ class TileField(nn.Module):
             with torch.set_grad_enabled(sampling.train_proposals and torch.is_grad_enabled()):
                 weights = self._weights(proposal, rays, edges_m, sampling.left)
             histograms.append(Histogram(edges, weights))
-            flattened = weights.detach() ** sampling.anneal
-            edges = samplers.resample(edges, flattened, count, jitter[number], self.shape.sampling.padding)
+            asked = weights.detach() ** sampling.anneal
+            if sampling.hints_m is not None:
+                asked = asked + HINTED * samplers.held(edges_m, sampling.hints_m)
+            edges = samplers.resample(edges, asked, count, jitter[number], self.shape.sampling.padding)
         return tuple(histograms), edges
 
     def query(

@@ -154,6 +154,13 @@ def test_the_stereo_loss_is_the_missing_weight_near_the_known_depth():
     torch.testing.assert_close(loss, expected)
 
 
+def test_a_bin_holds_the_depths_from_its_first_edge_to_before_its_last():
+    edges_m = torch.tensor([[1.0, 2.0, 4.0, 8.0]]).expand(2, -1)
+    depths_m = torch.tensor([[2.0, 3.9, 0.0], [1.0, 8.0, 7.0]])
+    expected = torch.tensor([[0.0, 2.0, 0.0], [1.0, 0.0, 1.0]])
+    assert torch.equal(samplers.held(edges_m, depths_m), expected)
+
+
 def test_fading_keeps_values_and_scales_gradients_by_the_squared_distance():
     density = torch.ones(1, 3, requires_grad=True)
     edges_m = torch.tensor([[0.0, 2.0, 8.0, 40.0]])  # middles at 1, 5 and 24 m

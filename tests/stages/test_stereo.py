@@ -17,7 +17,7 @@ from stages import stereo
 from stages.card_training import CardRun
 from stages.feeding import Feed
 from stages.ray_pool import RayPool
-from stages.stereo import Images, KnownDepths, depth_maps
+from stages.stereo import Images, KnownDepths, depth_maps, small_cameras
 from stages.training import Run, known_depths, train_tile, training_rows
 from tests.patterned_scene import GROUND, HEIGHT, INTRINSICS, WIDTH, camera_at, depth_m, picture, wall
 from tests.stages.small_training import street, tiny_job
@@ -152,7 +152,8 @@ def test_rays_of_images_end_at_their_known_depths(tmp_path):
     images, pixels = random.integers(len(frames), size=500), random.integers((WIDTH, HEIGHT), size=(500, 2))
     batch = pool.at(images, pixels)
     values = (torch.from_numpy(value.astype(np.float32)) for value in (batch.origins_world, batch.directions_world))
-    found_m = KnownDepths(maps, frames, WIDTH, "cpu").along(Rays(*values, None, torch.from_numpy(images))).numpy()
+    rays, labels = Rays(*values, None, torch.from_numpy(images)), torch.zeros(500, dtype=torch.uint8)
+    found_m = KnownDepths(maps, frames, WIDTH, "cpu").along(rays, labels)[:, 0].numpy()
     cells = images, pixels[:, 1] // CELL_PX, pixels[:, 0] // CELL_PX
     np.testing.assert_array_equal(found_m > 0, maps[cells] > 0)
     true_m = np.stack([depth_m(frames.camera_of(row), *PLANES) for row in range(len(frames))])
@@ -160,6 +161,23 @@ def test_rays_of_images_end_at_their_known_depths(tmp_path):
     forward_m = (met - batch.origins_world)[:, 0]  # all cameras look along x
     error = np.abs(forward_m / true_m[images, pixels[:, 1], pixels[:, 0]] - 1)[found_m > 0]
     assert (error < 0.1).mean() > 0.9  # a cell holds pixels of other depths too
+
+
+def test_slim_things_end_at_the_nearest_of_the_depths_around_them():
+    frames = drives()
+    maps = np.full((len(frames), HEIGHT // CELL_PX, WIDTH // CELL_PX), 20, np.float16)
+    maps[0, 3, 5], maps[0, 6:, 10:] = 4, 0  # a post in one cell; a corner of which nothing is known
+    columns, rows = np.array([5, 6, 7, 8, 10, 11]), np.array([3, 4, 3, 4, 6, 8])
+    camera = small_cameras(frames.select(np.array([0])), WIDTH)[0]
+    _, directions = camera.rays(CELL_PX * (np.stack([columns, rows], -1) + 0.5))
+    rays = Rays(torch.zeros(6, 3), torch.from_numpy(directions).float(), None, torch.zeros(6, dtype=torch.int64))
+    along_axis = torch.from_numpy(directions @ camera.world_from_camera[:3, 2]).float()
+    depths = KnownDepths(maps, frames, WIDTH, "cpu")
+    own, nearest = torch.tensor([4.0, 20, 20, 20, 0, 0]), torch.tensor([4.0, 4, 20, 20, 20, 0])
+    for label, ends in (("building", own), ("pole", nearest), ("traffic sign", nearest)):
+        labels = torch.full((6,), classes.CITYSCAPES.index(label), dtype=torch.uint8)
+        found = depths.along(rays, labels) * along_axis[:, None]
+        torch.testing.assert_close(found, torch.stack([ends, nearest], -1))
 
 
 def test_both_ways_to_train_heed_known_depths(tmp_path):
