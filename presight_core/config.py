@@ -121,7 +121,7 @@ class StereoSettings(Settings):
     """How far surfaces are, from neighbouring images alone, before training (`stages/stereo.py`). Not of the paper."""
 
     weight: Annotated[float, Field(ge=0)] = 0.0  # of the loss; 0: nothing is known, as in the paper
-    fades_from: Annotated[int, Field(ge=0)] = 1000  # step from which on the weight falls evenly, to 0 at the end
+    fades_from: Annotated[int, Field(ge=0)] = 1000  # step from which on they count evenly less, at the end nothing
     tolerance: Share = 0.015  # of the distance: rays end within it
     width_px: Count = 400  # at which images are compared
 

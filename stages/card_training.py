@@ -55,7 +55,7 @@ class CardRun(Run):
         size = (self._settings.batch_rays, DRAWS + self.passes)
         self._noise = torch.empty(size, device=job.device)
         self._anneal, self._rate = torch.ones((), device=job.device), torch.zeros((), device=job.device)
-        self._stereo_weight = torch.zeros((), device=job.device)
+        self._stereo_share = torch.zeros((), device=job.device)
         for group in self._optimiser.param_groups:
             group |= {"lr": self._rate, "capturable": True}
         self._replays = replays and job.device.startswith("cuda")
@@ -71,7 +71,7 @@ class CardRun(Run):
         exponent, trains_proposals = self._schedule(step)
         self._rate.fill_(schedule.learning_rate(step, self._settings))
         self._anneal.fill_(exponent)
-        self._stereo_weight.fill_(schedule.stereo_weight(step, self._settings))
+        self._stereo_share.fill_(schedule.stereo_share(step, self._settings))
         self._noise.copy_(self._random(step, *self._noise.shape))
         return self._recordings[trains_proposals]() if self._replays else self._body(trains_proposals)
 
@@ -97,9 +97,9 @@ class CardRun(Run):
             features_shape=self._settings.features_shape,
         )
         if self._card_ground is None:
-            return self._descend(rays, targets, sampling, self._stereo_weight)
+            return self._descend(rays, targets, sampling, self._stereo_share)
         start_m, end_m = self._card_ground.stretches(rays, targets.labels)
-        return self._descend(replace(rays, ends_m=end_m), targets, sampling, self._stereo_weight, start_m)
+        return self._descend(replace(rays, ends_m=end_m), targets, sampling, self._stereo_share, start_m)
 
     def _pool_frames(self, rows: NDArray[np.int64]) -> PoolFrames:
         frames = self._job.frames.select(rows)

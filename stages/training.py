@@ -33,6 +33,7 @@ from stages.stereo import Images, KnownDepths, depth_maps
 from stages.warm_start import FieldStart, go_on_from
 
 REPORT_SECONDS = 0.5
+HINT_WEIGHT = 0.2  # of known depths: two or three of 16 samples lie at each
 PULSE_WIDTHS = (0.03, 0.003)  # of the blurred interlevel loss, coarse proposal first (released code)
 
 
@@ -229,7 +230,7 @@ class Run:
             group["lr"] = schedule.learning_rate(step, self._settings)
         jitter = self._random(step, len(batch.rows), self.passes)
         exponent, trains_proposals = self._schedule(step)
-        stereo_weight = schedule.stereo_weight(step, self._settings)
+        stereo_share = schedule.stereo_share(step, self._settings)
         targets = Targets(
             *(torch.from_numpy(values).to(self._job.device) for values in (batch.rgb, batch.labels, batch.features))
         )
@@ -241,9 +242,9 @@ class Run:
             features_shape=self._settings.features_shape,
         )
         if self._ground is None:
-            return self._descend(self._rays(batch), targets, sampling, stereo_weight)
+            return self._descend(self._rays(batch), targets, sampling, stereo_share)
         start_m, end_m = (torch.from_numpy(value).to(self._job.device) for value in self._ground.stretches(batch))
-        return self._descend(replace(self._rays(batch), ends_m=end_m), targets, sampling, stereo_weight, start_m)
+        return self._descend(replace(self._rays(batch), ends_m=end_m), targets, sampling, stereo_share, start_m)
 
     @property
     def passes(self) -> int:
@@ -265,7 +266,7 @@ class Run:
         rays: Rays,
         targets: Targets,
         sampling: Sampling,
-        stereo_weight: float | Tensor,
+        stereo_share: float | Tensor,
         starts_m: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """One step of the optimiser; its losses by name. On a card nothing here may wait for it: see CardRun.
@@ -273,7 +274,8 @@ class Run:
         Where rays show the ground they must not end before `starts_m` (R,), metres; 0: nothing is known.
         """
         if self._depths is not None:
-            sampling = replace(sampling, hints_m=self._depths.along(rays, targets.labels))
+            hints = {"hints_m": self._depths.along(rays, targets.labels), "hint_weight": HINT_WEIGHT * stereo_share}
+            sampling = replace(sampling, **hints)
         rendering = self.field(rays, sampling)
         parts = self._losses(rendering, targets, sampling.train_proposals)
         if starts_m is not None:
@@ -283,7 +285,7 @@ class Run:
         if sampling.hints_m is not None:
             known = sampling.hints_m[:, 0], self._settings.stereo.tolerance
             loss = losses.stereo_loss(rendering.field.weights, rendering.edges_m, *known)
-            parts["stereo"] = stereo_weight * loss
+            parts["stereo"] = self._settings.stereo.weight * stereo_share * loss
         torch.stack(list(parts.values())).sum().backward()
         self._optimiser.step()
         self._optimiser.zero_grad()

@@ -20,13 +20,13 @@ def anneal_exponent(step: int, settings: TrainingSettings) -> float:
     return ANNEAL_SLOPE * progress / ((ANNEAL_SLOPE - 1) * progress + 1)
 
 
-def stereo_weight(step: int, settings: TrainingSettings) -> float:
-    """Weight of the depths that neighbouring images tell: whole at first, then it falls evenly to 0.
+def stereo_share(step: int, settings: TrainingSettings) -> float:
+    """How much the depths that neighbouring images tell still count: wholly at first, then evenly less, at the end 0.
 
     They say where surfaces are; thin things, edges and the one in ten that is wrong are left to colours.
     """
     fading_steps = max(settings.steps - settings.stereo.fades_from, 1)
-    return settings.stereo.weight * min(1.0, (settings.steps - step) / fading_steps)
+    return min(1.0, (settings.steps - step) / fading_steps)
 
 
 def trains_proposals(step: int, settings: TrainingSettings) -> bool:

@@ -26,7 +26,6 @@ from presight_core.field.spherical_harmonics import HARMONICS, spherical_harmoni
 from presight_core.tiles import SubField
 
 SKY_WIDTH = 32  # released code
-HINTED = 0.2  # that each depth of `Sampling.hints_m` adds to the weight, 1 in all at most, of the bin that holds it
 
 
 @dataclass(frozen=True)
@@ -79,6 +78,7 @@ class Sampling:
     fade_m: float = 0.0  # samples nearer to the camera than this learn less; see `fade_gradient`
     features_shape: bool = True  # False: density learns nothing from rendered features
     hints_m: Float[Tensor, "rays depths"] | None = None  # where samples go whatever the proposals say; 0: nowhere
+    hint_weight: float | Tensor = 0.0  # that each hint adds to the weight, 1 in all at most, of the bin that holds it
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ class TileField(nn.Module):
             histograms.append(Histogram(edges, weights))
             asked = weights.detach() ** sampling.anneal
             if sampling.hints_m is not None:
-                asked = asked + HINTED * samplers.held(edges_m, sampling.hints_m)
+                asked = asked + sampling.hint_weight * samplers.held(edges_m, sampling.hints_m)
             edges = samplers.resample(edges, asked, count, jitter[number], self.shape.sampling.padding)
         return tuple(histograms), edges
 

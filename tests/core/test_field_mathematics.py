@@ -230,11 +230,11 @@ def test_annealing_ends_at_one():
 
 
 def test_what_neighbouring_images_tell_weighs_less_and_less_in_long_trainings():
-    settings = TrainingSettings(steps=3000, stereo=StereoSettings(weight=0.03, fades_from=1000))
-    weights = [schedule.stereo_weight(step, settings) for step in (0, 1000, 2000, 3000)]
-    assert weights == pytest.approx([0.03, 0.03, 0.015, 0])
+    settings = TrainingSettings(steps=3000, stereo=StereoSettings(fades_from=1000))
+    shares = [schedule.stereo_share(step, settings) for step in (0, 1000, 2000, 3000)]
+    assert shares == pytest.approx([1, 1, 0.5, 0])
     short = settings.model_copy(update={"steps": 400})
-    assert [schedule.stereo_weight(step, short) for step in (0, 399)] == [0.03, 0.03]
+    assert [schedule.stereo_share(step, short) for step in (0, 399)] == [1, 1]
 
 
 def test_points_go_to_the_nearest_centroid_and_back_in_order():

@@ -161,10 +161,11 @@ def test_samples_are_placed_where_depths_are_hinted_at():
     field = small_field()
     rays = field.rays(*random_rays(40))
     hints_m = torch.tensor([7.0, 0.0]).expand(40, -1)  # a depth, and none
-    plain, hinted = (field(rays, Sampling(hints_m=hints)).edges_m for hints in (None, hints_m))
+    plain, hinted = (field(rays, Sampling(hints_m=hints_m, hint_weight=weight)).edges_m for weight in (0.0, 0.2))
     near = [((edges_m - 7).abs() < 0.5).sum(-1).float().mean() for edges_m in (plain, hinted)]
     assert near[1] > 2 * near[0]
-    torch.testing.assert_close(field(rays, Sampling(hints_m=torch.zeros(40, 2))).edges_m, plain)
+    torch.testing.assert_close(field(rays).edges_m, plain)
+    torch.testing.assert_close(field(rays, Sampling(hints_m=torch.zeros(40, 2), hint_weight=0.2)).edges_m, plain)
 
 
 def test_a_saved_field_renders_the_same(tmp_path):
