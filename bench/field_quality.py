@@ -209,10 +209,11 @@ def voxel_figures(tile: Tile, field: TileField, picture: Path) -> dict[str, Any]
         for least in DENSITIES
         for dense in (density > least,)
     }
+    best, hits = true_voxels(tile)
+    best_m = tile.surface.distance_m(best)
     figures["ceiling_of_hits"] = {
-        hits: scores(best, tile.surface.distance_m(best), seen, labels)
-        for hits in (1, tile.job.settings.extraction.min_hits)
-        for best in (true_voxels(tile, hits),)
+        least: scores(best[hits >= least], best_m[hits >= least], seen, labels)
+        for least in (1, tile.job.settings.extraction.min_hits)
     }
     return figures
 
@@ -275,13 +276,13 @@ def seen_surface(tile: Tile) -> tuple[NDArray, NDArray]:
     return points[first], labels[first]
 
 
-def true_voxels(tile: Tile, min_hits: int) -> NDArray[np.float64]:
-    """Centroids (N, 3) of what extraction would find if the field's depth were true, with at least so many hits."""
+def true_voxels(tile: Tile) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Centroids (N, 3) and hits (N,) of the voxels that extraction's rays would meet if the field's depth were true."""
     settings = tile.job.settings.extraction
     points, _ = true_points(tile, chosen_rows(tile.extraction), settings.pixel_stride)
     _, inverse, hits = np.unique(Lattice().voxel_of(points), axis=0, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(inverse.ravel(), axis) for axis in points.T], -1)
-    return (sums / hits[:, None])[hits >= min_hits]
+    return sums / hits[:, None], hits
 
 
 def draw_voxels(points: NDArray, distance_m: NDArray, file: Path) -> None:

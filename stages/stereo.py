@@ -93,7 +93,7 @@ class KnownDepths:
         around_m = torch.stack([self._at(rays.images, row + down, column + right) for down, right in AROUND])
         nearest_m = torch.where(around_m > 0, around_m, torch.inf).amin(0)
         nearest_m = torch.where(nearest_m < torch.inf, nearest_m, 0)
-        end_m = torch.where(self._is_slim[labels.long()], nearest_m, self._at(rays.images, row, column))
+        end_m = torch.where(self._is_slim[labels.long()], nearest_m, around_m[AROUND.index((0, 0))])
         return torch.stack([end_m, nearest_m], -1) / along_axis[:, None]
 
     def _at(self, images: Tensor, row: Tensor, column: Tensor) -> Tensor:

@@ -274,8 +274,8 @@ class Run:
         Where rays show the ground they must not end before `starts_m` (R,), metres; 0: nothing is known.
         """
         if self._depths is not None:
-            hints = {"hints_m": self._depths.along(rays, targets.labels), "hint_weight": HINT_WEIGHT * stereo_share}
-            sampling = replace(sampling, **hints)
+            known_m = self._depths.along(rays, targets.labels)
+            sampling = replace(sampling, hints_m=known_m, hint_weight=HINT_WEIGHT * stereo_share)
         rendering = self.field(rays, sampling)
         parts = self._losses(rendering, targets, sampling.train_proposals)
         if starts_m is not None:
