@@ -87,12 +87,13 @@ class _Volume:
     ) -> None:
         """Look at patches with the normals in the chosen cells, at all depths or those near the given ones."""
         normals = normals.reshape(-1, 3)
-        middle = np.zeros(len(normals)) if places is None else np.nan_to_num(places.ravel())
+        cells = np.flatnonzero(self._has_contrast & normals.any(-1) & chosen.ravel())
+        middle = np.zeros(len(cells)) if places is None else np.nan_to_num(places.ravel()[cells])
         reach = DEPTH_COUNT if places is None else NEAR_STEPS
         _fill_scores(
-            np.flatnonzero(self._has_contrast & normals.any(-1) & chosen.ravel()),
+            cells,
             self._patches,
-            _patch_rays(self._camera, self._pixels, normals),
+            _patch_rays(self._camera, self._pixels[cells], normals[cells]),
             self._sources,
             self._size_px,
             *self._motions,
@@ -186,65 +187,101 @@ def _planes(camera: Camera, normals: Float[NDArray, "rows columns 3"]) -> Float[
 def _fill_scores(cells, patches, rays, sources, size_px, turns, shifts, depths_m, first, last, scores, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
     """Fill, for the cells of the list and their depths first..last, how well the best two sources agree (0..1)."""
     for worker in prange(worker_count):
-        seen = np.empty((len(turns), 3, patches.shape[1]), np.float32)
-        at = np.empty(patches.shape[1], np.uint32)
+        seen, room = np.empty((patches.shape[1], 3), np.float32), _room(len(depths_m))
+        found, best, second = np.empty((3, len(depths_m)), np.float32)
         for place in range(worker, len(cells), worker_count):
-            cell = cells[place]
-            _turn(rays, cell, turns, seen)
-            for depth in range(first[cell], last[cell]):
-                best, second = np.float32(-1), np.float32(-1)
-                for source in range(len(turns)):
-                    if _project(seen, shifts, source, depths_m[depth], size_px, at):
-                        found = _correlation(patches, cell, sources, source, at)
-                        if found > best:
-                            best, second = found, best
-                        elif found > second:
-                            second = found
-                scores[cell, depth] = max(best + second, 0) / 2  # what hides the patch from others does not count
+            cell, start, end = cells[place], first[place], last[place]
+            best[start:end] = second[start:end] = -1
+            for source in range(len(turns)):
+                shift, image = shifts[source], sources[source]
+                _turn(rays[place], turns[source], seen)
+                low, high = _shown(seen[len(seen) // 2], shift, size_px, depths_m, start, end)
+                _correlate(patches[cell], seen, shift, image, size_px, depths_m[low:high], room, found[low:high])
+                for depth in range(low, high):
+                    second[depth] = max(second[depth], min(best[depth], found[depth]))
+                    best[depth] = max(best[depth], found[depth])
+            for depth in range(start, end):  # what hides the patch from others does not count
+                scores[cell, depth] = max(best[depth] + second[depth], np.float32(0)) / 2
 
 
-# The functions below get whole arrays and indices: slices of arrays would cost as much as the work on them.
-
-
-@numba.njit(fastmath=True, inline="always")
-def _turn(rays, cell, turns, seen):
-    """Fill seen (K, 3, S): the patch in each source's homogeneous pixels, shifts aside."""
-    for source in range(len(turns)):
+@numba.njit(fastmath=True)
+def _turn(rays, turn, seen):
+    """Fill seen (S, 3): the patch in a source's homogeneous pixels, the shift aside."""
+    for i in range(len(rays)):
         for axis in range(3):
-            x, y, z = turns[source, axis, 0], turns[source, axis, 1], turns[source, axis, 2]
-            for i in range(rays.shape[1]):
-                seen[source, axis, i] = x * rays[cell, i, 0] + y * rays[cell, i, 1] + z * rays[cell, i, 2]
+            seen[i, axis] = turn[axis, 0] * rays[i, 0] + turn[axis, 1] * rays[i, 1] + turn[axis, 2] * rays[i, 2]
 
 
-@numba.njit(fastmath=True, inline="always")
-def _project(seen, shifts, source, depth_m, size_px, at):
-    """Fill at (S,) with the patch's pixels in a source, counted row by row; False where one is outside."""
-    width, height = size_px
-    shift_x, shift_y, shift_z = shifts[source, 0], shifts[source, 1], shifts[source, 2]
-    middle = seen.shape[2] // 2
-    away_m = depth_m * seen[source, 2, middle] + shift_z
-    x, y = depth_m * seen[source, 0, middle] + shift_x, depth_m * seen[source, 1, middle] + shift_y
-    if away_m < REACH_M or x < 0 or y < 0 or x > width * away_m or y > height * away_m:
-        return False  # most are, and this costs less than the whole patch
-    low_x, high_x, low_y, high_y = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-    for i in range(seen.shape[2]):
-        scale = np.float32(1) / max(depth_m * seen[source, 2, i] + shift_z, REACH_M)
-        x = (depth_m * seen[source, 0, i] + shift_x) * scale
-        y = (depth_m * seen[source, 1, i] + shift_y) * scale
-        low_x, high_x, low_y, high_y = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
-        at[i] = np.uint32(np.int32(y) * width + np.int32(x))
-    return low_x >= 0 and low_y >= 0 and high_x < width and high_y < height
+@numba.njit(fastmath=True)
+def _shown(point, shift, size_px, depths_m, start, end):
+    """Of the depths start..end those at which a source's image holds a point: a stretch, for they lie on a line."""
+    while start < end and not _is_inside(point, shift, size_px, depths_m[start]):
+        start += 1
+    while start < end and not _is_inside(point, shift, size_px, depths_m[end - 1]):
+        end -= 1
+    return start, end
 
 
-@numba.njit(fastmath=True, inline="always")
-def _correlation(patches, cell, sources, source, at):
-    """Correlation of a patch of mean 0 and length 1 with the grey values at pixels; 0 where these hardly differ."""
-    total, squares, common = np.float32(0), np.float32(0), np.float32(0)
-    count = np.float32(len(at))
-    for i in range(len(at)):
-        value = np.float32(sources[source, at[i]])
-        total += value
-        squares += value * value
-        common += value * patches[cell, i]
-    spread = squares - total * total / count
-    return common / np.sqrt(spread) if spread > FLAT * count else np.float32(0)
+@numba.njit(fastmath=True)
+def _is_inside(point, shift, size_px, depth_m):
+    x, y, away_m = depth_m * point[0] + shift[0], depth_m * point[1] + shift[1], depth_m * point[2] + shift[2]
+    return away_m >= REACH_M and 0 <= x <= size_px[0] * away_m and 0 <= y <= size_px[1] * away_m
+
+
+@numba.njit
+def _room(count):
+    """What `_correlate` notes at each depth: three sums, how far outside the patch is, a point's place and its grey.
+
+    Six arrays, for only then the compiler sees that they lie apart, and takes many depths together.
+    """
+    a, b, c, d = _floats(count), _floats(count), _floats(count), _floats(count)
+    return a, b, c, d, np.empty(count, np.int32), np.empty(count, np.uint8)
+
+
+@numba.njit
+def _floats(count):
+    return np.empty(count, np.float32)
+
+
+# Below, vector instructions take many depths of a point together: each loop does one thing, so that they can.
+
+
+@numba.njit(fastmath=True)
+def _correlate(patch, seen, shift, image, size_px, depths_m, room, found):  # noqa: PLR0913, PLR0917 - numba wants arrays
+    """Fill found (D,): the correlation of a patch of mean 0 and length 1 with a source's grey values.
+
+    0 where these hardly differ, -1 where the patch is not wholly inside the source.
+    """
+    total, squares, common, outside, at, grey = room
+    size, count = np.float32(len(patch)), len(depths_m)
+    for depth in range(count):
+        total[depth] = squares[depth] = common[depth] = 0
+        outside[depth] = -1
+    for i in range(len(patch)):
+        _project(seen[i], shift, size_px, depths_m, at, outside)
+        for depth in range(count):
+            grey[depth] = image[np.uint32(at[depth])]
+        weight = patch[i]
+        for depth in range(count):
+            value = np.float32(grey[depth])
+            total[depth] += value
+            squares[depth] += value * value
+            common[depth] += value * weight
+    for depth in range(count):
+        spread = squares[depth] - total[depth] * total[depth] / size
+        alike = common[depth] / np.sqrt(spread) if spread > FLAT * size else np.float32(0)
+        found[depth] = alike if outside[depth] < 0 else np.float32(-1)
+
+
+@numba.njit(fastmath=True)
+def _project(point, shift, size_px, depths_m, at, outside):
+    """Fill at (D,): a point in a source, pixels counted row by row. Beyond the rim outside (D,) becomes 0 or more."""
+    (a, b, c), (u, v, w) = (point[0], point[1], point[2]), (shift[0], shift[1], shift[2])
+    stride, width, height = size_px[0], np.float32(size_px[0]), np.float32(size_px[1])
+    zero, one = np.float32(0), np.float32(1)
+    for depth in range(len(depths_m)):
+        scale = one / max(depths_m[depth] * c + w, REACH_M)
+        x, y = (depths_m[depth] * a + u) * scale, (depths_m[depth] * b + v) * scale
+        outside[depth] = max(outside[depth], -x, x - width, -y, y - height)
+        column, row = np.int32(min(max(x, zero), width - one)), np.int32(min(max(y, zero), height - one))
+        at[depth] = row * stride + column

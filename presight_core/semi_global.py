@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 STEP_COST, LEAP_COST = np.float32(0.2), np.float32(1.0)  # in units of correlation
 AT_BORDERS = np.float32(0.25)  # of these costs, where labels differ
-PATHS = np.array([(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # rows and columns a step
+# Rows and columns to the cell before, of the four paths that a scan from the first cell to the last follows; a scan
+# from the last to the first follows the other four.
+BEFORE = np.array([(0, -1), (-1, 0), (-1, -1), (-1, 1)])
 MAX_RATIO = np.float32(2)  # of the nearness of cells beside each other on a plane: more is a plane seen edge-on
 FLAT = 1e-3  # all depths cost the same: nothing is known
 
@@ -30,8 +32,9 @@ def best_places(
     proportional to a * column + b * row + c; cells whose plane is 0 are left out, and no path crosses them. `nearness`
     is 1 / depth, at even steps.
     """
-    costs = np.zeros(scores.shape, np.float32)
-    _add_paths(scores.astype(np.float32), planes.astype(np.float32), labels, nearness.astype(np.float32), costs)
+    scores, planes, costs = scores.astype(np.float32), planes.astype(np.float32), np.zeros(scores.shape, np.float32)
+    for side in (1, -1):
+        _add_paths(scores, planes, labels, nearness.astype(np.float32), side, costs)
     chosen = costs.argmin(-1)
     middle = chosen.clip(1, len(nearness) - 2)
     before, least, after = (np.take_along_axis(costs, (middle + i)[..., None], -1)[..., 0] for i in (-1, 0, 1))
@@ -42,24 +45,40 @@ def best_places(
 
 
 @numba.njit(fastmath=True, cache=True)
-def _add_paths(scores, planes, labels, nearness, costs):
-    """Add what the cheapest path from each side costs that ends in a cell at a depth, more than at the best depth."""
+def _add_paths(scores, planes, labels, nearness, side, costs):
+    """Add what the cheapest path costs that ends in a cell at a depth, more than at the best depth, for four paths.
+
+    `side` is 1 for the paths that come from above or the left, -1 for those from below or the right. Of each path only
+    two rows are kept: they stay in a core's cache.
+    """
     rows, columns, depths = scores.shape
-    path, beside = np.empty_like(scores), np.empty(depths, np.float32)
-    for down, right in PATHS:
-        for i in range(rows):
-            row = i if down >= 0 else rows - 1 - i
-            for j in range(columns):
-                column = j if right >= 0 else columns - 1 - j
-                own, before = path[row, column], (row - down, column - right)
-                own[:] = 1 - scores[row, column]
-                if 0 <= before[0] < rows and 0 <= before[1] < columns and planes[before].any():
-                    ratio = _ratio(planes[row, column], row, column, before)
-                    share = np.float32(1) if labels[before] == labels[row, column] else AT_BORDERS
-                    _fill_beside(path[before], beside)
-                    _go_on(path[before], beside, ratio, share, nearness, own)
-                own -= own.min()
-        costs += path
+    paths = np.empty((len(BEFORE), 2, columns, depths), np.float32)
+    own, room = np.empty(depths, np.float32), _room(depths)
+    first_place = nearness[0] / (nearness[1] - nearness[0])  # depths from where nearness is 0 to the first one
+    for i in range(rows):
+        row = i if side > 0 else rows - 1 - i
+        for j in range(columns):
+            column = j if side > 0 else columns - 1 - j
+            if not planes[row, column].any():
+                continue
+            for path in range(len(BEFORE)):
+                above, left = row + side * BEFORE[path, 0], column + side * BEFORE[path, 1]
+                for depth in range(depths):
+                    own[depth] = np.float32(1) - scores[row, column, depth]
+                if 0 <= above < rows and 0 <= left < columns and planes[above, left].any():
+                    ratio = _ratio(planes[row, column], row, column, (above, left))
+                    share = np.float32(1) if labels[above, left] == labels[row, column] else AT_BORDERS
+                    _go_on(paths[path, above % 2, left], ratio, share, first_place, room, own)
+                _settle(own, paths[path, row % 2, column], costs[row, column])
+
+
+@numba.njit(fastmath=True)
+def _settle(own, path, cost):
+    """Note what a path costs, more than at its best depth, and add it to the cell's cost."""
+    least = own.min()
+    for depth in range(len(own)):
+        path[depth] = own[depth] - least
+        cost[depth] += own[depth] - least
 
 
 @numba.njit(fastmath=True)
@@ -81,33 +100,45 @@ def _fill_beside(path, beside):
     beside[last - 1] = min(path[max(last - 2, 0)], path[last - 1], path[last])
 
 
-@numba.njit(fastmath=True)
-def _go_on(before, beside, ratio, share, nearness, own):
-    """Add to each depth's own cost the cheapest way to it from the cell before; `share` of the costs of leaving."""
-    last = len(before) - 1
-    step, leap, drift = share * STEP_COST, share * LEAP_COST, ratio - np.float32(1)
-    start = nearness[0] * drift / (nearness[1] - nearness[0])  # where the first depth lies in the cell before
-    depth = 0
-    while depth <= last:
-        place = start + depth * ratio
-        if place < 0 or place > last:  # nothing there to go on from
-            own[depth] += leap
-            depth += 1
-            continue
-        low = min(int(place), last - 1)
-        fraction = place - low
-        # The depths from here on that lie as many places from theirs: vector instructions take them together.
-        left = (1 - fraction) / drift if drift > 0 else (fraction / -drift if drift < 0 else np.float32(last))
-        end = depth + max(1, min(int(left), last + 1 - depth, last - low))
-        there = low + end - depth
-        _add_cheapest(before[low : there + 1], beside[low:there], fraction, drift, (step, leap), own[depth:end])
-        depth = end
+@numba.njit
+def _room(depths):
+    """What `_go_on` notes: a place for each depth, and five numbers.
+
+    Six arrays, for only then the compiler sees that they lie apart, and takes many depths together.
+    """
+    a, b, c, d, e = _floats(depths), _floats(depths), _floats(depths), _floats(depths), _floats(depths)
+    return np.empty(depths, np.int32), a, b, c, d, e
+
+
+@numba.njit
+def _floats(count):
+    return np.empty(count, np.float32)
 
 
 @numba.njit(fastmath=True)
-def _add_cheapest(before, beside, fraction, drift, costs, own):
-    """`_go_on` for depths each between one of `before` and the next: `fraction` of the way, and ever `drift` more."""
-    step, leap = costs
-    for i in range(len(own)):
-        straight = before[i] + (fraction + np.float32(i) * drift) * (before[i + 1] - before[i])
-        own[i] += min(straight, beside[i] + step, leap)
+def _go_on(before, ratio, share, first_place, room, own):
+    """Add to each depth's own cost the cheapest way to it from the cell before; `share` of the costs of leaving.
+
+    What is at a depth here is `ratio` as near in the cell before. Vector instructions take many depths together:
+    each loop does one thing, so that they can.
+    """
+    places, fractions, beside, lower, upper, around = room
+    last, start, half = np.int32(len(before) - 1), first_place * (ratio - np.float32(1)), np.float32(0.5)
+    step, leap = share * STEP_COST, share * LEAP_COST
+    _fill_beside(before, beside)
+    if ratio == 1:  # most cells face the camera at first: spared two of three loops
+        for depth in range(last):
+            own[depth] += min(before[depth], beside[depth] + step, leap)
+        own[last] += min(before[last], beside[last - 1] + step, leap)
+        return
+    for depth in range(len(own)):
+        place = start + np.float32(depth) * ratio
+        places[depth] = min(max(np.int32(place), np.int32(0)), last - np.int32(1))
+        fractions[depth] = place - np.float32(places[depth])
+    for depth in range(len(own)):
+        place = np.uint32(places[depth])
+        lower[depth], upper[depth], around[depth] = before[place], before[place + 1], beside[place]
+    for depth in range(len(own)):
+        straight = lower[depth] + fractions[depth] * (upper[depth] - lower[depth])
+        is_there = abs(fractions[depth] - half) <= half
+        own[depth] += min(min(straight, around[depth] + step) if is_there else leap, leap)
