@@ -25,12 +25,13 @@ from flows.demo import CITY
 from presight_core import classes, pictures
 from presight_core.cameras import pixel_centres
 from presight_core.field import rendering, threads
+from presight_core.field.lens import off_centre
 from presight_core.field.tile_field import TileField
 from presight_core.grid import Lattice
 from presight_core.pixels import cell_of
 from presight_core.priors.schema import CENTROID_STEPS, VoxelBatch, unpack_voxels
 from stages.extraction import CameraHeights, chosen_rows, extract_tile
-from stages.training import holdout_rows, video_numbers
+from stages.training import holdout_rows, lens_numbers, video_numbers
 
 FAR_M = 50.0  # depths beyond are of no use to a prior
 RAY_STRIDE = 8  # pixels between the rays of held-out frames: 1,400 an image
@@ -102,14 +103,19 @@ class View:
 
 
 @torch.no_grad()
-def render(tile: Tile, field: TileField, row: int, directions: NDArray[np.float64]) -> View:
-    """The field along rays from one frame's place, in the light of that frame's drive."""
-    origin, video = tile.job.frames.positions[row], video_numbers(tile.job.frames)[row]
+def render(tile: Tile, field: TileField, row: int, stride: int) -> View:
+    """The field along the rays of every `stride`-th pixel of a frame, through its lens, in the light of its drive."""
+    frames = tile.job.frames
+    camera, video, lens = frames.camera_of(row), video_numbers(frames)[row], lens_numbers(frames)[row]
+    pixels, size_px = pixel_centres(camera.width_px, camera.height_px, stride), (camera.width_px, camera.height_px)
+    origin, directions = camera.rays(pixels)
+    places = off_centre(pixels / size_px, np.broadcast_to(np.array(size_px, np.float64), pixels.shape))
     parts = []
     for first in range(0, len(directions), CHUNK_RAYS):
         chunk = directions[first : first + CHUNK_RAYS]
-        videos = np.full(len(chunk), video)
-        seen = field(field.rays(np.broadcast_to(origin, chunk.shape), chunk, videos))
+        videos, lenses = (np.full(len(chunk), number) for number in (video, lens))
+        through = lenses, places[first : first + CHUNK_RAYS]
+        seen = field(field.rays(np.broadcast_to(origin, chunk.shape), chunk, videos, None, *through))
         depth_m, found = rendering.first_hit_depth(seen.field.weights, seen.edges_m)
         parts.append((torch.where(found, depth_m, torch.inf), seen.rgb.clamp(0, 1), seen.features.clamp(0, 1)))
     return View(*(torch.cat(values).float().numpy() for values in zip(*parts, strict=True)))
@@ -120,7 +126,7 @@ def held_out_figures(tile: Tile, field: TileField) -> dict[str, Any]:
     errors, labels, squares, shown, wanted = [], [], [], [], []
     for row in holdout_rows(tile.job.frames, tile.job.settings.training).tolist():
         true = tile.truth.rays(row, RAY_STRIDE)
-        view, (rgb, features) = render(tile, field, row, true.directions), pixels_of(tile, row, RAY_STRIDE)
+        view, (rgb, features) = render(tile, field, row, RAY_STRIDE), pixels_of(tile, row, RAY_STRIDE)
         near = static_classes()[true.labels] & (true.distance_m < FAR_M)
         errors.append(np.abs(view.distance_m[near] / true.distance_m[near] - 1))
         labels.append(true.labels[near])
@@ -164,7 +170,7 @@ def draw_held_out(tile: Tile, field: TileField, file: Path) -> None:
     strips = []
     for row in rows[np.linspace(0, len(rows) - 1, PICTURE_ROWS).astype(int)].tolist():
         true = tile.truth.rays(row, PICTURE_STRIDE)
-        view = render(tile, field, row, true.directions)
+        view = render(tile, field, row, PICTURE_STRIDE)
         camera = tile.job.frames.camera_of(row)
         shape = len(range(PICTURE_STRIDE // 2, camera.height_px, PICTURE_STRIDE)), -1
         error = np.abs(view.distance_m / true.distance_m - 1)

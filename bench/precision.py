@@ -72,7 +72,7 @@ def batch(job: TileTraining, count: int, seed: tuple[int, int]) -> PixelBatch:
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     rgb, labels = seen_by(job.frames.positions[rows], directions)
     features = np.repeat(rgb[:, :1], CHANNELS, 1)
-    return PixelBatch(rows, job.frames.positions[rows], directions, rgb, labels, features)
+    return PixelBatch(rows, job.frames.positions[rows], directions, np.zeros(count), rgb, labels, features)
 
 
 def seen_by(origins: NDArray[np.float64], directions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:

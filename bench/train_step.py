@@ -182,6 +182,7 @@ def random_batch(job: TileTraining, seed: int) -> PixelBatch:
         rows,
         job.frames.positions[rows],
         directions / np.linalg.norm(directions, axis=-1, keepdims=True),
+        random.random(count),
         random.integers(256, size=(count, 3)).astype(np.uint8),
         random.integers(classes.SKY + 1, size=count).astype(np.uint8),
         random.integers(256, size=(count, CHANNELS)).astype(np.uint8),

@@ -82,6 +82,7 @@ class FieldSettings(Settings):
     geometry_channels: Count = 15
     video_embedding: Annotated[int, Field(ge=0)] = 12
     image_embedding: Annotated[int, Field(ge=0)] = 4
+    lens_falloff: bool = False  # learn how much darker each camera's images are in their corners; not of the paper
     density_bias: float = -4.0  # metres; the released code, whose poses are scaled by 0.05, needs none
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from presight_core import classes
 from presight_core.errors import InputError
+from presight_core.field.lens import off_centre
 from presight_core.field.tile_field import Rays
 from presight_core.pixels import FramePixels, PixelSource
 from stages.ray_pool import THIN, choose_images
@@ -43,6 +44,7 @@ class PoolFrames:
     sizes_px: NDArray[np.int64]  # (F, 2) width and height of the frame that pixels count in
     videos: NDArray[np.int64]  # (F,) number of the embedding
     images: NDArray[np.int64]  # (F,) likewise
+    lenses: NDArray[np.int64]  # (F,) number of the camera that took it
     sub_fields: NDArray[np.int64]  # (F,) nearest to the camera
 
 
@@ -135,7 +137,9 @@ class CardPool:
         frame_pixel = torch.cat([unit * buffers["sizes_px"][image], torch.ones_like(unit[:, :1])], -1)
         directions = torch.einsum("nij,nj->ni", buffers["world_from_pixel"][image], frame_pixel)
         directions = directions / directions.norm(dim=-1, keepdim=True)
-        rays = Rays(buffers["origins"][image], directions, buffers["videos"][image], buffers["images"][image])
+        numbers = (buffers[name][image] for name in ("videos", "images"))
+        places = off_centre(unit, buffers["sizes_px"][image])
+        rays = Rays(buffers["origins"][image], directions, *numbers, lenses=buffers["lenses"][image], off_centre=places)
         return rays, Targets(*(self._at(name, image, unit) for name in ("rgb", "labels", "features")))
 
     def close(self) -> None:
@@ -197,7 +201,7 @@ class CardPool:
         values |= {f"{name}_sizes": sizes[:, i] for i, name in enumerate(("rgb", "labels", "features"))}
         values |= {
             name: getattr(frames, name)[chosen]
-            for name in ("origins", "world_from_pixel", "sizes_px", "videos", "images")
+            for name in ("origins", "world_from_pixel", "sizes_px", "videos", "images", "lenses")
         }
         for name in images[0].grids:
             grids = [image.grids[name] for image in images]

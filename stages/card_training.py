@@ -113,6 +113,7 @@ class CardRun(Run):
             sizes_px=np.stack([frames.width_px, frames.height_px], -1).astype(np.int64),
             videos=self._videos[rows],
             images=self._images[rows],
+            lenses=self._lenses[rows],
             sub_fields=distances.argmin(-1),
         )
 

@@ -13,7 +13,7 @@ from presight_core.field.tile_field import TileField
 from presight_core.pixels import PixelSource
 from presight_core.progress import Progress, Report, silent
 from stages.ray_pool import PixelBatch, RayPool
-from stages.training import TileTraining, holdout_rows, video_numbers
+from stages.training import TileTraining, holdout_rows, lens_numbers, video_numbers
 
 METRIC_PIXELS = 40_000  # of all held-out images together: PSNR then varies by less than 0.1 dB between draws
 MIN_PIXELS = 200  # of an image, however many there are
@@ -80,13 +80,16 @@ class _View:
 
 
 @torch.no_grad()
-def _render(field: TileField, batch: PixelBatch, videos: NDArray[np.int64] | None = None) -> _View:
-    """What the field shows along the rays of a batch; the mean of all videos unless they are given."""
+def _render(
+    field: TileField, batch: PixelBatch, lenses: NDArray[np.int64], videos: NDArray[np.int64] | None = None
+) -> _View:
+    """What the field shows through each ray's lens (R,); the mean of all videos unless they are given."""
     parts = []
     for first in range(0, len(batch.rows), CHUNK_RAYS):
         chunk = slice(first, first + CHUNK_RAYS)
         chosen = None if videos is None else videos[chunk]
-        seen = field(field.rays(batch.origins_world[chunk], batch.directions_world[chunk], chosen))
+        through = lenses[chunk], batch.off_centre[chunk]
+        seen = field(field.rays(batch.origins_world[chunk], batch.directions_world[chunk], chosen, None, *through))
         depth_m, found = rendering.first_hit_depth(seen.field.weights, seen.edges_m)
         parts.append((seen.rgb.clamp(0, 1), seen.features.clamp(0, 1), depth_m * found))
     rgb, features, depth_m = (torch.cat(values).float().cpu().numpy() for values in zip(*parts, strict=True))
@@ -100,10 +103,11 @@ def _figures(job: TileTraining, field: TileField, pool: RayPool, pixel_count: in
     batch = batch.select(~classes.lookup(job.settings.features.dynamic_classes)[batch.labels])
     if not len(batch.rows):
         return {}
-    view = _render(field, batch)
+    lenses = lens_numbers(job.frames)[batch.rows]
+    view = _render(field, batch, lenses)
     figures = {
         "psnr_db": _psnr_db(view, batch),
-        "psnr_own_video_db": _psnr_db(_render(field, batch, video_numbers(job.frames)[batch.rows]), batch),
+        "psnr_own_video_db": _psnr_db(_render(field, batch, lenses, video_numbers(job.frames)[batch.rows]), batch),
         "feature_rmse": float(np.sqrt(np.mean((view.features - batch.features / np.float32(255)) ** 2))),
     }
     is_sky, known = batch.labels == classes.SKY, batch.labels != classes.UNKNOWN
@@ -125,7 +129,8 @@ def _picture_row(job: TileTraining, field: TileField, pool: RayPool) -> list[pic
     columns, rows = np.arange(stride // 2, width, stride), np.arange(stride // 2, height, stride)
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
     batch = pool.at(np.zeros(len(pixels), np.int64), pixels)
-    view = _render(field, batch, video_numbers(job.frames)[batch.rows])
+    numbers = (of(job.frames)[batch.rows] for of in (lens_numbers, video_numbers))
+    view = _render(field, batch, *numbers)
     shape = len(rows), len(columns), -1
     return [
         batch.rgb.reshape(shape),

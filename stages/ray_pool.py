@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from presight_core import classes
 from presight_core.drives import FrameTable
 from presight_core.errors import InputError
+from presight_core.field.lens import off_centre
 from presight_core.pixels import FramePixels, PixelSource
 
 THIN = ("pole", "traffic light", "traffic sign", "fence")  # a few pixels wide: even draws hardly ever meet them
@@ -24,6 +25,7 @@ class PixelBatch:
     rows: NDArray[np.int64]  # (R,) of the frame table
     origins_world: NDArray[np.float64]  # (R, 3) metres
     directions_world: NDArray[np.float64]  # (R, 3) unit length
+    off_centre: NDArray[np.float64]  # (R,) of the pixels; see `field.lens`
     rgb: NDArray[np.uint8]  # (R, 3)
     labels: NDArray[np.uint8]  # (R,) Cityscapes train ids, 255 unknown
     features: NDArray[np.uint8]  # (R, C), 255 = 1.0
@@ -96,6 +98,7 @@ class RayPool:
             self.rows[images],
             self._positions[images],
             directions / np.linalg.norm(directions, axis=-1, keepdims=True),
+            off_centre(unit, self._sizes_px[images]),
             self._rgb.at(images, unit),
             self._labels.at(images, unit),
             self._features.at(images, unit),

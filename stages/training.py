@@ -169,7 +169,7 @@ def holdout_mask(frames: FrameTable, every: int) -> NDArray[np.bool_]:
     mask = np.zeros(len(frames), np.bool_)
     if not every:
         return mask
-    names = np.char.add(np.char.add(frames.drive_id, "\n"), frames.camera)
+    names = _lens_names(frames)
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)
         rows = rows[np.argsort(frames.timestamp_us[rows], kind="stable")]
@@ -182,6 +182,11 @@ def video_numbers(frames: FrameTable) -> NDArray[np.int64]:
     return np.unique(frames.drive_id, return_inverse=True)[1].astype(np.int64)
 
 
+def lens_numbers(frames: FrameTable) -> NDArray[np.int64]:
+    """The number of the camera of each frame, in the field: those of different drives are different ones."""
+    return np.unique(_lens_names(frames), return_inverse=True)[1].astype(np.int64)
+
+
 def image_numbers(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.int64]:
     """The number of each trained frame in the field's embedding, -1 of the others.
 
@@ -191,6 +196,11 @@ def image_numbers(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.
     rows = training_rows(frames, settings)
     numbers[rows] = np.arange(len(rows))
     return numbers
+
+
+def _lens_names(frames: FrameTable) -> NDArray[np.str_]:
+    """A name for each camera of each drive, for each frame."""
+    return np.char.add(np.char.add(frames.drive_id, "\n"), frames.camera)
 
 
 def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -208,9 +218,10 @@ class Run:
         self._job, self._settings = job, job.settings.training
         self._file = scratch / "training.safetensors"
         self._videos, self._images = video_numbers(job.frames), image_numbers(job.frames, self._settings)
-        self.field = _new_field(job, int(self._videos.max()) + 1, int(self._images.max()) + 1)
+        self._lenses = lens_numbers(job.frames)
+        self.field = _new_field(job, *(int(each.max()) + 1 for each in (self._videos, self._images, self._lenses)))
         if job.start:
-            go_on_from(job.start, self.field, job.frames, self._images)
+            go_on_from(job.start, self.field, job.frames, self._images, self._lenses)
         self._names = {id(parameter): name for name, parameter in self.field.named_parameters()}
         is_table = {id(parameter): name.endswith("grid.table") for name, parameter in self.field.named_parameters()}
         tables = [parameter for parameter in self.field.parameters() if is_table[id(parameter)]]
@@ -321,8 +332,8 @@ class Run:
             self._optimiser.state[parameter] = {quantity: values[name] for quantity, values in state.items()}
 
     def _rays(self, batch: PixelBatch) -> Rays:
-        videos, images = self._videos[batch.rows], self._images[batch.rows]
-        return self.field.rays(batch.origins_world, batch.directions_world, videos, images)
+        numbers = (each[batch.rows] for each in (self._videos, self._images, self._lenses))
+        return self.field.rays(batch.origins_world, batch.directions_world, *numbers, off_centre=batch.off_centre)
 
     def _losses(self, rendering: Rendering, targets: Targets, trains_proposals: bool) -> dict[str, Tensor]:
         """The five losses (paper, section 3.2), weighted."""
@@ -339,10 +350,10 @@ class Run:
         return parts
 
 
-def _new_field(job: TileTraining, video_count: int, image_count: int) -> TileField:
+def _new_field(job: TileTraining, video_count: int, image_count: int, lens_count: int) -> TileField:
     """A field with random parameters that depend on the seed alone."""
     settings = job.settings
-    counts = (job.feature_channels, video_count, image_count)
+    counts = (job.feature_channels, video_count, image_count, lens_count)
     shape = FieldShape(job.sub_fields, settings.field, settings.sampling, *counts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.training.seed)

@@ -13,7 +13,7 @@ from presight_core.errors import InputError
 from presight_core.field.checkpoint import load_field
 from presight_core.field.tile_field import TileField
 
-EMBEDDINGS = ("video_embedding.weight", "image_embedding.weight")
+TABLES = ("video_embedding.weight", "image_embedding.weight", "lenses.terms")  # a row a video, image or lens
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,15 @@ class FieldStart:
     drives: tuple[str, ...]  # that it was trained on
 
 
-def go_on_from(start: FieldStart, field: TileField, frames: FrameTable, images: NDArray[np.int64]) -> None:
+def go_on_from(
+    start: FieldStart, field: TileField, frames: FrameTable, images: NDArray[np.int64], lenses: NDArray[np.int64]
+) -> None:
     """Give a new field the parameters of an earlier one of the same shape.
 
-    `images` (N,) are the frames' numbers in the embedding, -1 of those not trained on. Videos and images that the
-    earlier field knew keep their rows, new ones begin with the mean of all, which is what evaluation shows. Raises
-    NotFoundError or InputError if the earlier field is not there, damaged, or of another shape.
+    `images` (N,) are the frames' numbers in the embedding, -1 of those not trained on, `lenses` (N,) those of their
+    cameras. Videos, images and cameras that the earlier field knew keep their rows, new ones begin with the mean of
+    all, which is what evaluation shows. Raises NotFoundError or InputError if the earlier field is not there, damaged,
+    or of another shape.
     """
     device = str(field.centroids.device)
     earlier = load_field(start.folder, device)
@@ -41,15 +44,17 @@ def go_on_from(start: FieldStart, field: TileField, frames: FrameTable, images: 
     tensors = dict(earlier.state_dict())
     names = np.unique(frames.drive_id)
     known = np.isin(frames.drive_id, start.drives)
-    rows = np.flatnonzero(np.isin(names, start.drives)), np.sort(images[known & (images >= 0)])
-    counts = field.shape.video_count, field.shape.image_count
-    for embedding, known_rows, count in zip(EMBEDDINGS, rows, counts, strict=True):
-        tensors[embedding] = _spread_rows(tensors[embedding], known_rows, count)
+    videos = np.flatnonzero(np.isin(names, start.drives))
+    rows = videos, np.sort(images[known & (images >= 0)]), np.unique(lenses[known])
+    counts = field.shape.video_count, field.shape.image_count, field.shape.lens_count
+    for table, known_rows, count in zip(TABLES, rows, counts, strict=True):
+        if table in tensors:
+            tensors[table] = _spread_rows(tensors[table], known_rows, count)
     field.load_state_dict(tensors)
 
 
 def _spread_rows(earlier: Tensor, rows: NDArray[np.int64], count: int) -> Tensor:
-    """An embedding of `count` rows: the earlier ones at `rows`, their mean elsewhere.
+    """A table of `count` rows: the earlier ones at `rows`, their mean elsewhere.
 
     The mean everywhere if the numbers do not fit: then an image was refused, or came back, and rows cannot be told.
     """

@@ -14,6 +14,8 @@ class Rays:
     directions: Float[Tensor, "rays 3"]  # unit length
     videos: Int[Tensor, " rays"] | None = None
     images: Int[Tensor, " rays"] | None = None
+    lenses: Int[Tensor, " rays"] | None = None  # that took the images; None: colours as in the images' middles
+    off_centre: Float[Tensor, " rays"] | None = None  # of the pixels, where there are lenses; see `lens`
     ends_m: Float[Tensor, " rays"] | None = None  # nothing lies beyond; None or inf: the far plane
 
     def points(self, edges_m: Float[Tensor, "rays edges"]) -> Float[Tensor, "rays samples 3"]:

@@ -20,6 +20,7 @@ from presight_core.field.assignment import Assignment, assign
 from presight_core.field.contraction import grid_position, grid_positions
 from presight_core.field.early_stop import weights_until
 from presight_core.field.hash_grid import HashGrid
+from presight_core.field.lens import LensFalloff
 from presight_core.field.mlp import SubFieldMlp
 from presight_core.field.rays import Rays
 from presight_core.field.spherical_harmonics import HARMONICS, spherical_harmonics
@@ -38,6 +39,7 @@ class FieldShape:
     feature_channels: int
     video_count: int
     image_count: int
+    lens_count: int = 0  # cameras whose falloff is learned, where the settings say so
 
     def to_json(self) -> dict[str, Any]:
         """The shape as JSON values."""
@@ -55,7 +57,8 @@ class FieldShape:
             SubField(**{name: tuple(corner) for name, corner in sub_field.items()}) for sub_field in value["sub_fields"]
         )
         settings, sampling = FieldSettings(**value["settings"]), SamplingSettings(**value["sampling"])
-        counts = (int(value[name]) for name in ("feature_channels", "video_count", "image_count"))
+        names = ("feature_channels", "video_count", "image_count", "lens_count")
+        counts = (int(value.get(name, 0)) for name in names)  # fields of before there were lenses have none
         return FieldShape(sub_fields, settings, sampling, *counts)
 
 
@@ -146,6 +149,7 @@ class TileField(nn.Module):
         self.sky_features = SubFieldMlp(count, (HARMONICS, SKY_WIDTH, SKY_WIDTH, channels))
         self.video_embedding = nn.Embedding(shape.video_count, video)
         self.image_embedding = nn.Embedding(shape.image_count, image)
+        self.lenses = LensFalloff(shape.lens_count) if settings.lens_falloff else None
         self.proposals = nn.ModuleList(
             DensityNetwork(grid, count, settings.proposal_width, 1) for grid in settings.proposals
         )
@@ -187,6 +191,8 @@ class TileField(nn.Module):
         directions_world: NDArray[np.float64],
         videos: NDArray[np.int64] | None = None,
         images: NDArray[np.int64] | None = None,
+        lenses: NDArray[np.int64] | None = None,
+        off_centre: NDArray[np.float64] | None = None,
     ) -> Rays:
         """Rays of world origins (R, 3), metres, and unit directions (R, 3), on the field's device.
 
@@ -199,9 +205,10 @@ class TileField(nn.Module):
         )
         numbers = (
             None if value is None else torch.from_numpy(np.asarray(value, np.int64)).to(device)
-            for value in (videos, images)
+            for value in (videos, images, lenses)
         )
-        return Rays(*vectors, *numbers)
+        places = None if off_centre is None else torch.from_numpy(np.asarray(off_centre, np.float32)).to(device)
+        return Rays(*vectors, *numbers, off_centre=places)
 
     def forward(self, rays: Rays, sampling: Sampling = Sampling()) -> Rendering:
         """Render rays: sample, query, blend, and add the sky behind."""
@@ -214,9 +221,12 @@ class TileField(nn.Module):
         weights = rendering.ray_weights(values.density, edges_m.diff(dim=-1))
         behind = 1 - weights.sum(-1, keepdim=True)
         sky_rgb, sky_features = self._sky(rays, conditions)
+        rgb = rendering.blend(weights, values.rgb) + behind * sky_rgb
+        if self.lenses is not None and rays.lenses is not None:
+            rgb = rgb * self.lenses(rays.lenses, rays.off_centre)
         shares = (weights, behind) if sampling.features_shape else (weights.detach(), behind.detach())
         return Rendering(
-            rendering.blend(weights, values.rgb) + behind * sky_rgb,
+            rgb,
             rendering.blend(shares[0], values.features) + shares[1] * sky_features,
             edges_m,
             Histogram(edges, weights),

@@ -93,6 +93,8 @@ def test_rays_and_targets_are_those_of_the_pool_on_the_host(tmp_path):
     np.testing.assert_allclose(rays.origins.numpy() + run.field.origin_m, expected.origins_world, atol=1e-5)
     np.testing.assert_array_equal(rays.images, images)
     np.testing.assert_array_equal(rays.videos, images % 2)
+    np.testing.assert_array_equal(rays.lenses, images % 2)
+    np.testing.assert_allclose(rays.off_centre, expected.off_centre, atol=1e-6)
 
 
 def test_dynamic_pixels_are_never_drawn_and_all_others_are(tmp_path):
@@ -168,7 +170,7 @@ def test_the_ground_is_where_the_host_finds_it():
     origins = cameras[random.integers(30, size=count)]
     nothing = np.zeros((count, 3), np.uint8)
     expected = Ground(cameras, settings).stretches(
-        PixelBatch(np.zeros(count, np.int64), origins, directions, nothing, labels, nothing)
+        PixelBatch(np.zeros(count, np.int64), origins, directions, np.zeros(count), nothing, labels, nothing)
     )
     rays = Rays(*(torch.from_numpy(value.astype(np.float32)) for value in (origins - origin_m, directions)))
     found = CardGround(cameras, origin_m, settings, "cpu").stretches(rays, torch.from_numpy(labels))

@@ -18,7 +18,13 @@ def look_down(label: int, descent: float = 0.5, origin: tuple[float, float, floa
     direction = np.array([[np.sqrt(1 - descent**2), 0.0, -descent]])
     colours, features = np.zeros((1, 3), np.uint8), np.zeros((1, 2), np.uint8)
     return PixelBatch(
-        np.zeros(1, np.int64), np.array([origin]), direction, colours, np.array([label], np.uint8), features
+        np.zeros(1, np.int64),
+        np.array([origin]),
+        direction,
+        np.zeros(1),
+        colours,
+        np.array([label], np.uint8),
+        features,
     )
 
 

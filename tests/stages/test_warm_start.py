@@ -11,7 +11,7 @@ from presight_core.errors import InputError
 from presight_core.field.checkpoint import load_field
 from presight_core.field.tile_field import TileField
 from presight_core.progress import Progress
-from stages.training import TileTraining, image_numbers, train_tile
+from stages.training import TileTraining, image_numbers, lens_numbers, train_tile
 from stages.warm_start import FieldStart, go_on_from
 from tests.stages.small_training import Gradient, street, tiny_job
 
@@ -35,16 +35,16 @@ def new_field(start: FieldStart) -> tuple[TileField, np.ndarray]:
     """A field for both drives that went on from the earlier one, and the numbers of its images."""
     job = tiny_job(frames=FRAMES)
     images = image_numbers(FRAMES, job.settings.training)
-    shape = replace(load_field(start.folder).shape, video_count=2, image_count=int(images.max()) + 1)
+    shape = replace(load_field(start.folder).shape, video_count=2, image_count=int(images.max()) + 1, lens_count=2)
     field = TileField(shape)
-    go_on_from(start, field, FRAMES, images)
+    go_on_from(start, field, FRAMES, images, lens_numbers(FRAMES))
     return field, images
 
 
 def test_it_keeps_every_parameter_of_the_earlier_one(earlier):
     field, old = new_field(earlier)[0], dict(load_field(earlier.folder).named_parameters())
     for name, parameter in field.named_parameters():
-        if "embedding" not in name:
+        if "embedding" not in name and "lenses" not in name:
             assert torch.equal(parameter, old[name]), name
 
 
@@ -59,6 +59,13 @@ def test_known_videos_and_images_keep_their_rows_and_new_ones_get_the_mean(earli
     torch.testing.assert_close(field.image_embedding.weight[others], mean.repeat(len(others), 1))
 
 
+def test_known_cameras_keep_their_falloff_and_new_ones_begin_with_the_mean(earlier):
+    field, old = new_field(earlier)[0], load_field(earlier.folder)
+    assert field.lenses is not None and old.lenses is not None
+    assert old.lenses.terms.abs().min() > 0
+    assert torch.equal(field.lenses.terms, old.lenses.terms.expand(2, -1))  # one known camera, whose row is the mean
+
+
 def test_rows_that_cannot_be_told_get_the_mean(earlier):
     field = new_field(replace(earlier, drives=("drive0", "drive1")))[0]
     mean = load_field(earlier.folder).image_embedding.weight.mean(0)
@@ -68,7 +75,8 @@ def test_rows_that_cannot_be_told_get_the_mean(earlier):
 def test_a_field_of_another_shape_is_refused(earlier):
     field = TileField(replace(load_field(earlier.folder).shape, feature_channels=4))
     with pytest.raises(InputError, match="another field's feature_channels"):
-        go_on_from(earlier, field, FRAMES, image_numbers(FRAMES, tiny_job().settings.training))
+        images = image_numbers(FRAMES, tiny_job().settings.training)
+        go_on_from(earlier, field, FRAMES, images, lens_numbers(FRAMES))
 
 
 def loss_of(job: TileTraining, scratch: Path) -> float:
