@@ -24,6 +24,7 @@ VARIANTS: dict[str, list[str]] = {
     "no floor": ["sampling.floor_m=1000.0"],
     "no ground": ["training.ground.weight=0.0"],
     "no stereo": ["training.stereo.weight=0.0"],
+    "no lens falloff": ["field.lens_falloff=false"],
     "no thin weight": ["training.thin_weight=1.0"],
 }
 COLUMNS = ("steps", "minutes", "psnr_db", "psnr_own_video_db", "feature_rmse", "found_share", "sky_share")

@@ -92,10 +92,19 @@ def resized(rgb: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np
 
 
 def grey_level(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The brightness (H, W) of an image, smoothed over three pixels: for comparing images, not for looking at."""
+    """The brightness (H, W) of an image."""
     import cv2
 
-    return cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (3, 3), 0).astype(np.uint8, copy=False)
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
+
+
+def enlarged(grey: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
+    """A grey image (H, W) with `scale` times the rows and columns, on cubic curves through the pixels that it had."""
+    import cv2
+
+    height, width = grey.shape
+    size_px = scale * width, scale * height
+    return cv2.resize(grey, size_px, interpolation=cv2.INTER_CUBIC).astype(np.uint8, copy=False)
 
 
 def _content(file: Path, what: str, cure: str) -> NDArray[np.uint8]:

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
-STEP_COST, LEAP_COST = np.float32(0.2), np.float32(1.0)  # in units of correlation
-AT_BORDERS = np.float32(0.25)  # of these costs, where labels differ
+STEP_COST, LEAP_COST = np.float32(0.3), np.float32(1.4)  # in units of correlation
+AT_BORDERS = np.float32(0.5)  # of these costs, where labels differ
 # Rows and columns to the cell before, of the four paths that a scan from the first cell to the last follows; a scan
 # from the last to the first follows the other four.
 BEFORE = np.array([(0, -1), (-1, 0), (-1, -1), (-1, 1)])

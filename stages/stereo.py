@@ -1,6 +1,6 @@
 """How far the surfaces in a tile's images are, from neighbouring images alone, before anything is trained.
 
-Each image is compared with the eight of its drive that show most of the same (`plane_sweep`). Depths stay where
+Each image is compared with the twelve of its drive that show most of the same (`plane_sweep`). Depths stay where
 another image, looked at for itself, says the same of the place: nine in ten of those are right
 (docs/benchmarks/field.md). The field is then told to end its rays there.
 """
@@ -29,7 +29,7 @@ from stages.neighbours import Neighbours
 LEVEL = classes.lookup(("road", "sidewalk", "terrain"))  # patches of these lie flat, others face the camera at first
 NOWHERE = classes.lookup((*classes.DYNAMIC, "sky"))  # no ray of training wants to know where these are
 SLIM = classes.lookup(("pole", "traffic light", "traffic sign"))  # narrower than a cell, which may show what is behind
-SOURCES = 8  # images that an image is compared with
+SOURCES = 12  # images that an image is compared with
 JUDGES = 20  # images that are asked whether they found the same
 AGREEING = 1  # of the judges must have; with two, fields find less and are hardly purer
 MAX_DIFFERENCE = 0.04  # between depths that agree, a share; their mean is more exact than any of them

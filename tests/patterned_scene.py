@@ -70,6 +70,7 @@ def picture(camera: Camera, *planes: Plane) -> NDArray[np.uint8]:
 
 @cache
 def _pattern() -> NDArray[np.float64]:
-    """Spots of a few texels, 0..255, on a square of 1024."""
-    noise = gaussian_filter(np.random.default_rng(0).normal(size=(1024, 1024)), 2, mode="wrap")
+    """Spots of one to a few texels, 0..255, on a square of 1024."""
+    fine = np.random.default_rng(0).normal(size=(1024, 1024))
+    noise = sum(sigma * gaussian_filter(fine, sigma, mode="wrap") for sigma in (1, 2))
     return np.clip(128 + 50 * noise / noise.std(), 0, 255)

