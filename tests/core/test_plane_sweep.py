@@ -65,8 +65,8 @@ def test_a_patch_that_only_faces_the_camera_at_first_is_laid_into_the_plane_of_i
 def test_the_exposure_of_other_images_does_not_matter():
     sources = views(BESIDE, wall(9.0))
     darker = [View((source.grey * 0.4 + 30).astype(np.uint8), source.camera) for source in sources]
-    plain, found = (sweep(view(REFERENCE, wall(9.0)), FACING, each)[INNER] for each in (sources, darker))
-    assert np.abs(found / 9.0 - 1).mean() < 1.5 * np.abs(plain / 9.0 - 1).mean()  # of 0.4 as many grey levels
+    found = sweep(view(REFERENCE, wall(9.0)), FACING, darker)[INNER]
+    assert np.abs(found / 9.0 - 1).mean() < 0.03  # 0.4 as many grey levels tell it less exactly
 
 
 def test_two_images_that_see_the_place_are_enough():
