@@ -107,9 +107,12 @@ def render(tile: Tile, field: TileField, row: int, stride: int) -> View:
     """The field along the rays of every `stride`-th pixel of a frame, through its lens, in the light of its drive."""
     frames = tile.job.frames
     camera, video, lens = frames.camera_of(row), video_numbers(frames)[row], lens_numbers(frames)[row]
-    pixels, size_px = pixel_centres(camera.width_px, camera.height_px, stride), (camera.width_px, camera.height_px)
+    pixels, size_px = (
+        pixel_centres(camera.width_px, camera.height_px, stride),
+        np.array([camera.width_px, camera.height_px]),
+    )
     origin, directions = camera.rays(pixels)
-    places = off_centre(pixels / size_px, np.broadcast_to(np.array(size_px, np.float64), pixels.shape))
+    places = off_centre(pixels / size_px, size_px)
     parts = []
     for first in range(0, len(directions), CHUNK_RAYS):
         chunk = directions[first : first + CHUNK_RAYS]

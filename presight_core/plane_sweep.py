@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from presight_core.cameras import Camera, pixel_centres
 from presight_core.images import enlarged
 from presight_core.local_planes import planes_around
-from presight_core.semi_global import best_places
+from presight_core.semi_global import best_places, floats
 
 CELL_PX = 4  # a depth is found for every fourth pixel of every fourth row
 # (13, 2) offsets, the middle in the middle: the black squares of a board of five by five pixels. What is in front
@@ -243,13 +243,8 @@ def _room(count):
 
     Six arrays, for only then the compiler sees that they lie apart, and takes many depths together.
     """
-    a, b, c, d = _floats(count), _floats(count), _floats(count), _floats(count)
+    a, b, c, d = floats(count), floats(count), floats(count), floats(count)
     return a, b, c, d, np.empty(count, np.int32), np.empty(count, np.uint8)
-
-
-@numba.njit
-def _floats(count):
-    return np.empty(count, np.float32)
 
 
 # Below, vector instructions take many depths of a point together: each loop does one thing, so that they can.

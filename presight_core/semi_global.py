@@ -106,12 +106,13 @@ def _room(depths):
 
     Six arrays, for only then the compiler sees that they lie apart, and takes many depths together.
     """
-    a, b, c, d, e = _floats(depths), _floats(depths), _floats(depths), _floats(depths), _floats(depths)
+    a, b, c, d, e = floats(depths), floats(depths), floats(depths), floats(depths), floats(depths)
     return np.empty(depths, np.int32), a, b, c, d, e
 
 
 @numba.njit
-def _floats(count):
+def floats(count):
+    """Room for so many numbers, in an array of its own."""
     return np.empty(count, np.float32)
 
 

@@ -137,9 +137,9 @@ class CardPool:
         frame_pixel = torch.cat([unit * buffers["sizes_px"][image], torch.ones_like(unit[:, :1])], -1)
         directions = torch.einsum("nij,nj->ni", buffers["world_from_pixel"][image], frame_pixel)
         directions = directions / directions.norm(dim=-1, keepdim=True)
-        numbers = (buffers[name][image] for name in ("videos", "images"))
+        numbers = (buffers[name][image] for name in ("videos", "images", "lenses"))
         places = off_centre(unit, buffers["sizes_px"][image])
-        rays = Rays(buffers["origins"][image], directions, *numbers, lenses=buffers["lenses"][image], off_centre=places)
+        rays = Rays(buffers["origins"][image], directions, *numbers, off_centre=places)
         return rays, Targets(*(self._at(name, image, unit) for name in ("rgb", "labels", "features")))
 
     def close(self) -> None:

@@ -21,6 +21,7 @@ MAX_IMAGES = 200  # evenly spread; more would only cost time
 PICTURE_PIXELS = 30_000  # of an image in the picture
 PICTURE_ROWS = 3
 CHUNK_RAYS = 8192
+_Numbers = tuple[NDArray[np.int64], NDArray[np.int64]]  # of all frames' lenses and videos
 COLUMNS = ("real", "rendered", "depth", "real feature", "rendered feature")
 
 
@@ -44,13 +45,14 @@ def evaluate_tile(
     """
     rows = _spread(holdout_rows(job.frames, job.settings.training), MAX_IMAGES)
     shown = set(_spread(rows, PICTURE_ROWS).tolist())
+    numbers = lens_numbers(job.frames), video_numbers(job.frames)
     table, picture_rows = [], []
     for done, row in enumerate(rows.tolist()):
         report(Progress("evaluation", done, len(rows)))
         pool = RayPool(job.frames, source, np.array([row]))
-        table.append(_figures(job, field, pool, max(MIN_PIXELS, METRIC_PIXELS // len(rows))))
+        table.append(_figures(job, field, pool, numbers, max(MIN_PIXELS, METRIC_PIXELS // len(rows))))
         if row in shown:
-            picture_rows.append(_picture_row(job, field, pool))
+            picture_rows.append(_picture_row(field, pool, numbers))
     if picture_rows:
         pictures_folder.mkdir(parents=True, exist_ok=True)
         pictures.save_png(pictures_folder / "rows.png", pictures.stack_rows(picture_rows, COLUMNS))
@@ -96,18 +98,20 @@ def _render(
     return _View(rgb, features, depth_m)
 
 
-def _figures(job: TileTraining, field: TileField, pool: RayPool, pixel_count: int) -> dict[str, float]:
+def _figures(
+    job: TileTraining, field: TileField, pool: RayPool, numbers: _Numbers, pixel_count: int
+) -> dict[str, float]:
     """Figures of one image, from random pixels of it; those without any pixel to speak of are left out."""
     random = np.random.default_rng([job.settings.training.seed, int(pool.rows[0])])
     batch = pool.draw(pixel_count, [np.array([0])], random)
     batch = batch.select(~classes.lookup(job.settings.features.dynamic_classes)[batch.labels])
     if not len(batch.rows):
         return {}
-    lenses = lens_numbers(job.frames)[batch.rows]
+    lenses, videos = (each[batch.rows] for each in numbers)
     view = _render(field, batch, lenses)
     figures = {
         "psnr_db": _psnr_db(view, batch),
-        "psnr_own_video_db": _psnr_db(_render(field, batch, lenses, video_numbers(job.frames)[batch.rows]), batch),
+        "psnr_own_video_db": _psnr_db(_render(field, batch, lenses, videos), batch),
         "feature_rmse": float(np.sqrt(np.mean((view.features - batch.features / np.float32(255)) ** 2))),
     }
     is_sky, known = batch.labels == classes.SKY, batch.labels != classes.UNKNOWN
@@ -122,15 +126,14 @@ def _psnr_db(view: _View, batch: PixelBatch) -> float:
     return -10 * float(np.log10(max(error, 1e-10)))  # 100 dB at most
 
 
-def _picture_row(job: TileTraining, field: TileField, pool: RayPool) -> list[pictures.Rgb]:
+def _picture_row(field: TileField, pool: RayPool, numbers: _Numbers) -> list[pictures.Rgb]:
     """The image, its rendering with the embedding of its own drive, depth, features and rendered features."""
     width, height = pool.size_px(0)
     stride = max(1, round((width * height / PICTURE_PIXELS) ** 0.5))
     columns, rows = np.arange(stride // 2, width, stride), np.arange(stride // 2, height, stride)
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
     batch = pool.at(np.zeros(len(pixels), np.int64), pixels)
-    numbers = (of(job.frames)[batch.rows] for of in (lens_numbers, video_numbers))
-    view = _render(field, batch, *numbers)
+    view = _render(field, batch, *(each[batch.rows] for each in numbers))
     shape = len(rows), len(columns), -1
     return [
         batch.rgb.reshape(shape),

@@ -169,9 +169,9 @@ def holdout_mask(frames: FrameTable, every: int) -> NDArray[np.bool_]:
     mask = np.zeros(len(frames), np.bool_)
     if not every:
         return mask
-    names = _lens_names(frames)
-    for name in np.unique(names):
-        rows = np.flatnonzero(names == name)
+    lenses = lens_numbers(frames)
+    for lens in np.unique(lenses):
+        rows = np.flatnonzero(lenses == lens)
         rows = rows[np.argsort(frames.timestamp_us[rows], kind="stable")]
         mask[rows[every // 2 :: every]] = True
     return mask
@@ -184,7 +184,8 @@ def video_numbers(frames: FrameTable) -> NDArray[np.int64]:
 
 def lens_numbers(frames: FrameTable) -> NDArray[np.int64]:
     """The number of the camera of each frame, in the field: those of different drives are different ones."""
-    return np.unique(_lens_names(frames), return_inverse=True)[1].astype(np.int64)
+    names = np.char.add(np.char.add(frames.drive_id, "\n"), frames.camera)
+    return np.unique(names, return_inverse=True)[1].astype(np.int64)
 
 
 def image_numbers(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.int64]:
@@ -196,11 +197,6 @@ def image_numbers(frames: FrameTable, settings: TrainingSettings) -> NDArray[np.
     rows = training_rows(frames, settings)
     numbers[rows] = np.arange(len(rows))
     return numbers
-
-
-def _lens_names(frames: FrameTable) -> NDArray[np.str_]:
-    """A name for each camera of each drive, for each frame."""
-    return np.char.add(np.char.add(frames.drive_id, "\n"), frames.camera)
 
 
 def _split(frames: FrameTable, settings: TrainingSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -34,7 +34,7 @@ class LensFalloff(nn.Module):
 def off_centre(unit: Array, size_px: Array) -> Array:
     """Squared distances (R,) from images' middles, 1 in their corners.
 
-    `unit` (R, 2) are places in the images, x and y in 0..1; `size_px` (R, 2) their widths and heights.
+    `unit` (R, 2) are places in the images, x and y in 0..1; `size_px` (R, 2), or (2,) of all, their widths and heights.
     """
     squares: Any = (((unit - 0.5) * size_px) ** 2).sum(-1)
     return 4 * squares / (size_px**2).sum(-1)

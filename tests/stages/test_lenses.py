@@ -18,17 +18,12 @@ LOSS = 0.3  # of the light, in the corners
 LONG = ("training.steps=200", "training.batch_rays=256", "training.warmup=0.0", "training.ground.weight=0.0")
 
 
-def middles() -> tuple[np.ndarray, np.ndarray]:
-    """Places of the pixels of a small image, and its size for each of them."""
-    unit = np.stack(np.meshgrid(*((np.arange(size) + 0.5) / size for size in SIZE)), -1).reshape(-1, 2)
-    return unit, np.tile(np.array(SIZE, np.float64), (len(unit), 1))
-
-
 class Vignetted(Gradient):
     """The same grey everywhere, but for the lens."""
 
     def load(self, row: int) -> FramePixels:
-        brightness = 200 * (1 - LOSS * off_centre(*middles())).reshape(SIZE[::-1])
+        middles = np.stack(np.meshgrid(*((np.arange(size) + 0.5) / size for size in SIZE)), -1).reshape(-1, 2)
+        brightness = 200 * (1 - LOSS * off_centre(middles, np.array(SIZE))).reshape(SIZE[::-1])
         rgb = np.repeat(brightness[..., None], 3, -1).round().astype(np.uint8)
         return replace(super().load(row), rgb=rgb)
 
