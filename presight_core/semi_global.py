@@ -17,6 +17,9 @@ AT_BORDERS = np.float32(0.5)  # of these costs, where labels differ
 # from the last to the first follows the other four.
 BEFORE = np.array([(0, -1), (-1, 0), (-1, -1), (-1, 1)])
 MAX_RATIO = np.float32(2)  # of the nearness of cells beside each other on a plane: more is a plane seen edge-on
+# Minima of many depths at once, but sums as they are written: fused or in another order they were rounded otherwise by
+# code that was just compiled than by the same code from the cache, and cells of equal costs got other depths.
+ANY_ORDER_OF_LEAST = {"nnan", "nsz"}
 FLAT = 1e-3  # all depths cost the same: nothing is known
 
 
@@ -44,7 +47,7 @@ def best_places(
     return np.where(planes.any(-1) & (np.ptp(costs, -1) > FLAT), places, np.nan)
 
 
-@numba.njit(fastmath=True, cache=True)
+@numba.njit(fastmath=ANY_ORDER_OF_LEAST, cache=True)
 def _add_paths(scores, planes, labels, nearness, side, costs):
     """Add what the cheapest path costs that ends in a cell at a depth, more than at the best depth, for four paths.
 
@@ -72,7 +75,7 @@ def _add_paths(scores, planes, labels, nearness, side, costs):
                 _settle(own, paths[path, row % 2, column], costs[row, column])
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=ANY_ORDER_OF_LEAST)
 def _settle(own, path, cost):
     """Note what a path costs, more than at its best depth, and add it to the cell's cost."""
     least = own.min()
@@ -81,7 +84,7 @@ def _settle(own, path, cost):
         cost[depth] += own[depth] - least
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=ANY_ORDER_OF_LEAST)
 def _ratio(plane, row, column, before):
     """How much nearer the plane of a cell is in the cell before it; 1 where it is seen edge-on."""
     here = plane[0] * column + plane[1] * row + plane[2]
@@ -90,7 +93,7 @@ def _ratio(plane, row, column, before):
     return ratio if 1 / MAX_RATIO < ratio < MAX_RATIO else np.float32(1)
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=ANY_ORDER_OF_LEAST)
 def _fill_beside(path, beside):
     """Fill, for each place between two depths, what is least of those and of the ones next to them."""
     last = len(path) - 1
@@ -116,7 +119,7 @@ def floats(count):
     return np.empty(count, np.float32)
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=ANY_ORDER_OF_LEAST)
 def _go_on(before, ratio, share, first_place, room, own):
     """Add to each depth's own cost the cheapest way to it from the cell before; `share` of the costs of leaving.
 

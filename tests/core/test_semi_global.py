@@ -1,5 +1,9 @@
 """Depths of cells that suit those around them, on grids made by hand."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -61,3 +65,19 @@ def test_no_path_crosses_cells_that_are_left_out():
     places = best_places(scores, planes, ALIKE, NEARNESS)
     np.testing.assert_allclose(places[:, :5], 7, atol=0.2)
     assert np.isnan(places[:, 5:]).all()
+
+
+def test_code_compiled_now_and_code_from_the_cache_agree(tmp_path):
+    program = (
+        "import sys, numpy as np; from presight_core.semi_global import best_places;"
+        "scores = np.random.default_rng(0).random((16, 24, 200), np.float32);"
+        "planes, labels = np.broadcast_to((0.0, -0.01, 1.0), (16, 24, 3)), np.zeros((16, 24), np.uint8);"
+        "places = best_places(scores, planes, labels, np.linspace(0.4, 0.01, 200));"
+        "sys.stdout.buffer.write(places.tobytes())"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert first == second
