@@ -22,6 +22,7 @@ from presight_core.local_planes import planes_around
 from presight_core.semi_global import best_places, floats
 
 CELL_PX = 4  # a depth is found for every fourth pixel of every fourth row
+MIDDLE_PX = CELL_PX // 2 + 0.5  # of a cell: where the middle of that pixel is
 # (13, 2) offsets, the middle in the middle: the black squares of a board of five by five pixels. What is in front
 # grows by half a patch at its edges.
 PATCH_PX = np.mgrid[-2:3, -2:3][::-1].reshape(2, -1).T[::2]
@@ -35,6 +36,7 @@ TURNS = 2  # how often patches are laid anew
 NEAR_STEPS = 10  # depths to each side of the one found before that a patch laid anew is put at
 FLAT = np.float32(0.05)  # grey levels, squared: sources that differ less than that show nothing
 MAX_TILT = 2.0  # a patch is at most so many times nearer or farther at its rim than at its centre
+MAX_SLOPE = 0.5  # of the nearness of a cell: what grows more to the next is seen edge-on
 
 
 @dataclass(frozen=True)
@@ -54,19 +56,21 @@ class Cells:
     labels: UInt8[NDArray, "rows columns"]  # where they differ, a surface seldom goes on
 
 
-def sweep(reference: View, cells: Cells, sources: Sequence[View]) -> Float[NDArray, "rows columns"]:
-    """Depths along the optical axis, metres, at the middle of every cell, that explain the sources best.
+def sweep(reference: View, cells: Cells, sources: Sequence[View]) -> Float[NDArray, "rows columns 3"]:
+    """The plane in every cell that explains the sources best: 1 / depth at its middle, and how much more it is beside.
 
-    0 where nothing is known. There must be two sources at least, all of one size.
+    Depths are along the optical axis, metres; beside are the next cells to the right and below. 0 where nothing is
+    known. There must be two sources at least, all of one size.
     """
-    volume = _Volume(reference, cells, sources)
-    volume.score(cells.normals, ~np.zeros_like(cells.is_known))
-    places = volume.best_places(cells.normals)
+    volume, normals = _Volume(reference, cells, sources), cells.normals
+    volume.score(normals, ~np.zeros_like(cells.is_known))
+    places = volume.best_places(normals)
     for _ in range(TURNS):
         normals, is_new = _turned(reference.camera, cells, places)
         volume.score(normals, is_new, places)
         places = volume.best_places(normals)
-    return np.nan_to_num(1 / _nearness(places), nan=0.0).astype(np.float32)
+    nearness = np.nan_to_num(_nearness(places))[..., None]
+    return nearness * np.concatenate([np.ones_like(nearness), _slopes(reference.camera, normals)], -1)
 
 
 class _Volume:
@@ -139,7 +143,7 @@ def _turned(
 
 def _pixel_from_cell() -> NDArray[np.float64]:
     """Takes a cell's column and row to the pixel in its middle, homogeneous."""
-    return np.array([[CELL_PX, 0, CELL_PX / 2], [0, CELL_PX, CELL_PX / 2], [0, 0, 1]])
+    return np.array([[CELL_PX, 0, MIDDLE_PX], [0, CELL_PX, MIDDLE_PX], [0, 0, 1]])
 
 
 def _enlarged(view: View) -> View:
@@ -190,6 +194,15 @@ def _patch_rays(
 def _planes(camera: Camera, normals: Float[NDArray, "rows columns 3"]) -> Float[NDArray, "rows columns 3"]:
     """The planes with the normals as `best_places` wants them: 1 / depth at the middles of cells."""
     return normals @ np.linalg.inv(camera.intrinsics) @ _pixel_from_cell()
+
+
+def _slopes(camera: Camera, normals: Float[NDArray, "rows columns 3"]) -> Float[NDArray, "rows columns 2"]:
+    """By what share of a cell's nearness the planes with the normals are nearer in the next cells."""
+    planes, (row, column) = _planes(camera, normals), np.indices(normals.shape[:2])
+    here = planes[..., 0] * column + planes[..., 1] * row + planes[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = np.nan_to_num(planes[..., :2] / here[..., None], posinf=0, neginf=0)
+    return slopes.clip(-MAX_SLOPE, MAX_SLOPE)
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)

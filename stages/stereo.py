@@ -22,7 +22,7 @@ from presight_core.drives import FrameTable
 from presight_core.field.rays import Rays
 from presight_core.images import grey_level, resized
 from presight_core.pixels import PixelSource, cell_of
-from presight_core.plane_sweep import CELL_PX, Cells, View, grid_shape, sweep
+from presight_core.plane_sweep import CELL_PX, MIDDLE_PX, Cells, View, grid_shape, sweep
 from presight_core.progress import Progress, Report, silent
 from stages.neighbours import Neighbours
 
@@ -31,12 +31,14 @@ NOWHERE = classes.lookup((*classes.DYNAMIC, "sky"))  # no ray of training wants 
 SLIM = classes.lookup(("pole", "traffic light", "traffic sign"))  # narrower than a cell, which may show what is behind
 SOURCES = 12  # images that an image is compared with
 JUDGES = 20  # images that are asked whether they found the same
-AGREEING = 1  # of the judges must have; with two, fields find less and are hardly purer
+AGREEING = 1  # of the judges must have; with more, or a share of those that see the place, fields find less
 MAX_DIFFERENCE = 0.04  # between depths that agree, a share; their mean is more exact than any of them
+MIDDLE = MIDDLE_PX / CELL_PX  # of a cell, from its left and upper side
+MAX_RATIO = 2.0  # of the nearness of a plane in the cell next to its own
 AROUND = tuple(product((-1, 0, 1), repeat=2))  # rows and columns to the cells around, and its own
 KEPT_VIEWS = 512  # small images in memory, 50 MB: a drive's neighbours follow each other in time
 
-DepthMaps = Float16[NDArray, "images rows columns"]  # metres along the optical axis; 0 where nothing is known
+PlaneMaps = Float16[NDArray, "images rows columns 3"]  # the plane in each cell, as `sweep` tells it
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,8 @@ class Images:
     source: PixelSource
 
 
-def depth_maps(images: Images, width_px: int, file: Path, report: Report = silent) -> DepthMaps:
-    """The depths that are known of each image. They are kept in `file`, and taken from there the next time.
+def plane_maps(images: Images, width_px: int, file: Path, report: Report = silent) -> PlaneMaps:
+    """The planes that are known of each image. They are kept in `file`, and taken from there the next time.
 
     Images are compared at the given width, or at their own if that is less. Raises InputError if an image cannot be
     read.
@@ -71,8 +73,8 @@ def depth_maps(images: Images, width_px: int, file: Path, report: Report = silen
 class KnownDepths:
     """Where rays of trained images end, as far as that is known."""
 
-    def __init__(self, maps: DepthMaps, frames: FrameTable, width_px: int, device: str) -> None:
-        """Depth maps of `depth_maps`, whose frames are numbered as the field's images."""
+    def __init__(self, maps: PlaneMaps, frames: FrameTable, width_px: int, device: str) -> None:
+        """Maps of `plane_maps`, whose frames are numbered as the field's images."""
         cell_from_pixel = np.diag([1 / CELL_PX, 1 / CELL_PX, 1])
         cell_from_world = [
             cell_from_pixel @ camera.intrinsics @ camera.world_from_camera[:3, :3].T
@@ -89,17 +91,23 @@ class KnownDepths:
         """
         assert rays.images is not None, "rays of training come from images"
         x, y, along_axis = torch.einsum("nij,nj->in", self._cell_from_world[rays.images], rays.directions)
-        row, column = (y / along_axis).long(), (x / along_axis).long()
-        around_m = torch.stack([self._at(rays.images, row + down, column + right) for down, right in AROUND])
-        nearest_m = torch.where(around_m > 0, around_m, torch.inf).amin(0)
-        nearest_m = torch.where(nearest_m < torch.inf, nearest_m, 0)
-        end_m = torch.where(self._is_slim[labels.long()], nearest_m, around_m[AROUND.index((0, 0))])
-        return torch.stack([end_m, nearest_m], -1) / along_axis[:, None]
+        column, row = x / along_axis, y / along_axis
+        around = torch.stack([self._nearness(rays.images, row, column, down, right) for down, right in AROUND])
+        nearest = around.amax(0)
+        end = torch.where(self._is_slim[labels.long()], nearest, around[AROUND.index((0, 0))])
+        nearness = torch.stack([end, nearest], -1) * along_axis[:, None]
+        return torch.where(nearness > 0, 1 / nearness, 0)
 
-    def _at(self, images: Tensor, row: Tensor, column: Tensor) -> Tensor:
-        """Depths of cells, of those at the rim for cells beyond it."""
-        _, row_count, column_count = self._maps.shape
-        return self._maps[images, row.clamp(0, row_count - 1), column.clamp(0, column_count - 1)]
+    def _nearness(self, images: Tensor, row: Tensor, column: Tensor, down: int, right: int) -> Tensor:
+        """1 / depth at places, counted in cells, if the plane of a cell some rows down and columns right goes on there.
+
+        0 where it is unknown. Beyond the rim the planes are those of the cells there.
+        """
+        _, row_count, column_count, _ = self._maps.shape
+        i, j = (row.long() + down).clamp(0, row_count - 1), (column.long() + right).clamp(0, column_count - 1)
+        nearness, *growth = self._maps[images, i, j].float().unbind(-1)
+        there = nearness + (column - j - MIDDLE) * growth[0] + (row - i - MIDDLE) * growth[1]
+        return there.clamp(nearness / MAX_RATIO, nearness * MAX_RATIO)
 
 
 class _Comparison:
@@ -112,31 +120,33 @@ class _Comparison:
         self._neighbours = Neighbours(chosen)
         self._view = lru_cache(KEPT_VIEWS)(self._load)
         self.in_order = np.lexsort([chosen.timestamp_us, chosen.drive_id]).tolist()
-        self.shape = len(cameras), *np.max([grid_shape(each.width_px, each.height_px) for each in cameras], 0).tolist()
+        shapes = [grid_shape(each.width_px, each.height_px) for each in cameras]
+        self.shape = len(cameras), *np.max(shapes, 0).tolist(), 3
 
-    def guess(self, image: int, guesses: DepthMaps) -> None:
+    def guess(self, image: int, guesses: PlaneMaps) -> None:
         """Write the depths at which other images of the drive, so in the same light, look best."""
         others = self._neighbours.of(image)
         others = others[self._drive_id[others] == self._drive_id[image]][:SOURCES].tolist()
         if others:
             _put(guesses[image], sweep(*self._view(image), [self._view(other)[0] for other in others]))
 
-    def judge(self, image: int, guesses: DepthMaps, agreed: DepthMaps) -> None:
+    def judge(self, image: int, guesses: PlaneMaps, agreed: PlaneMaps) -> None:
         """Write the guesses with which those of other images, of any drive, agree: the mean of all of them."""
         camera = self._cameras[image]
         shape = grid_shape(camera.width_px, camera.height_px)
-        depth_m = guesses[image, : shape[0], : shape[1]].astype(np.float64).ravel()
-        known = np.flatnonzero(depth_m)
+        planes = guesses[image, : shape[0], : shape[1]].astype(np.float64).reshape(-1, 3)
+        known = np.flatnonzero(planes[:, 0])
         origin, directions = camera.rays(pixel_centres(camera.width_px, camera.height_px, CELL_PX)[known])
-        points = origin + (depth_m[known] / (directions @ camera.world_from_camera[:3, 2]))[:, None] * directions
-        votes, total = np.zeros(len(known), np.int64), np.zeros(len(known))
+        points = origin + directions / (planes[known, 0] * (directions @ camera.world_from_camera[:3, 2]))[:, None]
+        votes, total = np.zeros((2, len(known)))
         for judge in self._neighbours.of(image)[:JUDGES].tolist():
             difference = _difference(self._cameras[judge], guesses[judge], points)
             agrees = np.abs(difference) < MAX_DIFFERENCE
             votes += agrees
             total += np.where(agrees, difference, 0)
-        depth_m[known] *= np.where(votes >= AGREEING, 1 + total / (votes + 1), 0)  # its own guess is one, too
-        _put(agreed[image], depth_m.reshape(shape))
+        factor = 1 / (1 + total / (votes + 1))  # its own guess is one, too
+        planes[known] *= np.where(votes >= AGREEING, factor, 0)[:, None]
+        _put(agreed[image], planes.reshape(*shape, 3))
 
     def _load(self, image: int) -> tuple[View, Cells]:
         """A small grey image, and what labels tell of its cells."""
@@ -161,20 +171,24 @@ def small_cameras(frames: FrameTable, width_px: int) -> list[Camera]:
 
 
 def _difference(
-    camera: Camera, guess: Float16[NDArray, "rows columns"], points_world: NDArray
+    camera: Camera, guess: Float16[NDArray, "rows columns 3"], points_world: NDArray
 ) -> Float[NDArray, " points"]:
     """How much farther than points (N, 3) in the world a camera's guess puts what is there, a share; NaN outside."""
     pixels, depth_m = camera.project(points_world)
     inside = np.flatnonzero(np.all((pixels >= 0) & (pixels < [camera.width_px, camera.height_px]), axis=-1))
-    columns, rows = np.minimum(pixels[inside] // CELL_PX, np.array(guess.shape)[::-1] - 1).astype(np.int64).T
+    place = pixels[inside] / CELL_PX
+    columns, rows = np.minimum(place, np.array(guess.shape)[1::-1] - 1).astype(np.int64).T
+    nearness, right, down = guess[rows, columns].astype(np.float64).T
+    there = nearness + (place[:, 0] - columns - MIDDLE) * right + (place[:, 1] - rows - MIDDLE) * down
     difference = np.full(len(points_world), np.nan)
-    difference[inside] = guess[rows, columns] / depth_m[inside] - 1
+    with np.errstate(divide="ignore"):
+        difference[inside] = 1 / (there * depth_m[inside]) - 1
     return difference
 
 
-def _put(grid: DepthMaps, depths_m: NDArray) -> None:
+def _put(grid: PlaneMaps, planes: NDArray) -> None:
     """Fill the corner of a grid, which may be of a larger image."""
-    grid[: depths_m.shape[0], : depths_m.shape[1]] = depths_m
+    grid[: planes.shape[0], : planes.shape[1]] = planes
 
 
 def _new_array(file: Path, shape: tuple[int, ...]) -> np.memmap:

@@ -29,7 +29,7 @@ from stages.card_pool import Targets
 from stages.feeding import Feed
 from stages.ground import Ground
 from stages.ray_pool import PixelBatch
-from stages.stereo import Images, KnownDepths, depth_maps
+from stages.stereo import Images, KnownDepths, plane_maps
 from stages.warm_start import FieldStart, go_on_from
 
 REPORT_SECONDS = 0.5
@@ -122,7 +122,7 @@ def known_depths(
         return None
     scratch.mkdir(parents=True, exist_ok=True)
     images = Images(job.frames, rows, source)
-    maps = depth_maps(images, width_px, scratch / f"stereo-{job.recipe.digest}.npy", report)
+    maps = plane_maps(images, width_px, scratch / f"stereo-{job.recipe.digest}.npy", report)
     return KnownDepths(maps, job.frames.select(rows), width_px, job.device)
 
 

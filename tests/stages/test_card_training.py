@@ -72,7 +72,8 @@ def card_run(tmp_path: Path, *overrides: str, table: FrameTable | None = None) -
     table = frames() if table is None else table
     settings = tiny_settings("training.holdout_every=0", *overrides)
     job = TileTraining("t000", table, SUB_FIELDS, settings, feature_channels=3)
-    depths = KnownDepths(np.full((len(table), 2, 3), 8, np.float16), table, WIDTH, "cpu")  # everything 8 m ahead
+    planes = np.tile(np.array([1 / 8, 0, 0], np.float16), (len(table), 2, 3, 1))  # everything 8 m ahead
+    depths = KnownDepths(planes, table, WIDTH, "cpu")
     is_known = settings.training.stereo.weight > 0
     return CardRun(job, tmp_path, Numbered(), np.arange(len(table)), depths=depths if is_known else None)
 
