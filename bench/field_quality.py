@@ -222,7 +222,7 @@ def voxel_figures(tile: Tile, field: TileField, picture: Path) -> dict[str, Any]
     best_m = tile.surface.distance_m(best)
     figures["ceiling_of_hits"] = {
         least: scores(best[hits >= least], best_m[hits >= least], seen, labels)
-        for least in (1, tile.job.settings.extraction.min_hits)
+        for least in (1, 2)
     }
     return figures
 

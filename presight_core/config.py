@@ -164,9 +164,9 @@ class ExtractionSettings(Settings):
     max_depth_m: Metres = 50.0
     below_camera_m: Metres = 3.0
     above_camera_m: Metres = 6.0
+    fog_density: Annotated[float, Field(ge=0)] = 0.0  # per metre: rays go through what is thinner; 0: as in the paper
     min_density: float = 0.05  # per metre; mean of the three networks (1.0 in the released code's scaled units)
     min_hits: Count = 2  # released code drops voxels with the minimum hit count
-    lone_density: Annotated[float, Field(ge=0)] = 0.0  # per metre: denser voxels need one hit only; 0: none does
 
 
 class ValidationSettings(Settings):

@@ -95,7 +95,7 @@ def extract_tile(
         sums.add(samples, job.drives.index(str(job.frames.drive_id[row])))
         report(Progress("extraction", done, len(rows), {"points": counts["points"]}))
     columns.keep(job.owned)
-    counts["voxels"], counts["few_hits"] = sums.finish(settings.min_hits, settings.lone_density)
+    counts["voxels"], counts["few_hits"] = sums.finish(settings.min_hits)
     return ExtractionResult(voxel_batches(sums, columns), job.drives, dict(counts))
 
 
@@ -148,7 +148,8 @@ def _surfaces(job: TileExtraction, field: TileField, frames: list[Rays]) -> Iter
     settings = job.settings.extraction
     origins = np.concatenate([np.broadcast_to(rays.origin, rays.directions.shape) for rays in frames])
     directions = np.concatenate([rays.directions for rays in frames])
-    surface = find_surface(field, origins, directions, settings.surface, settings.features == "field")
+    with_features = settings.features == "field"
+    surface = find_surface(field, origins, directions, settings.surface, with_features, settings.fog_density)
     ends = np.cumsum([len(rays.directions) for rays in frames])
     for first, last in zip([0, *ends], ends, strict=False):
         yield surface.select(slice(first, last))

@@ -84,12 +84,8 @@ class VoxelSums:
             if len(merged) > self._memory_rows // 2:  # less would sort the same rows again and again
                 self._spill()
 
-    def finish(self, min_hits: int, lone_density: float = 0.0) -> tuple[int, int]:
-        """Merge all sums; how many voxels are kept, and how many dropped.
-
-        Kept are those with at least `min_hits` points, or where fewer, on average, are denser than `lone_density` per
-        metre; 0: none of those.
-        """
+    def finish(self, min_hits: int) -> tuple[int, int]:
+        """Merge all sums; how many voxels are kept, for having at least `min_hits` points, and how many dropped."""
         if self._runs:
             self._runs = [_add_up(np.concatenate(self._runs))]
             self._spill()
@@ -97,8 +93,6 @@ class VoxelSums:
         for superblock in self._numbers:
             rows = self._merge(self._file(superblock))
             enough = rows["hits"] >= min_hits
-            if lone_density:
-                enough |= rows["sums"][:, -1] > lone_density * rows["hits"]
             self._write(self._file(superblock), rows[enough], "wb")
             kept, dropped = kept + int(enough.sum()), dropped + int((~enough).sum())
         return kept, dropped

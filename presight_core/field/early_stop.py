@@ -13,10 +13,13 @@ STAGES = 8  # of the samples of a ray; it is followed from one to the next
 MIN_SAMPLES = 8  # of a stage: fewer are not worth the bookkeeping
 
 
-def weights_until(density_at: Callable[[Tensor], Tensor], rays: Rays, edges_m: Tensor, left: float) -> Tensor:
+def weights_until(
+    density_at: Callable[[Tensor], Tensor], rays: Rays, edges_m: Tensor, left: float, fog: float = 0.0
+) -> Tensor:
     """`ray_weights` (rays, bins) of the densities at points, zero beyond where at most `left` of a ray is left.
 
-    Behind a surface there is nothing to see, and half of all samples lie there. Without gradients.
+    Behind a surface there is nothing to see, and half of all samples lie there. What is thinner than `fog`, per metre,
+    counts as nothing. Without gradients.
     """
     stage = samples_of_stage(edges_m.shape[1] - 1)
     density = torch.zeros_like(edges_m[:, 1:])
@@ -24,6 +27,7 @@ def weights_until(density_at: Callable[[Tensor], Tensor], rays: Rays, edges_m: T
     for first in range(0, density.shape[1], stage):
         edges = edges_m[followed, first : first + stage + 1]
         part = density_at(Rays(rays.origins[followed], rays.directions[followed]).points(edges))
+        part = torch.where(part < fog, 0, part)
         density[followed, first : first + stage] = part
         optical = optical + (part * edges.diff(dim=-1)).sum(-1)
         unfinished = optical < -math.log(left)

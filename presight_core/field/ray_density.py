@@ -49,8 +49,11 @@ def ray_density(  # noqa: PLR0913, PLR0917 - all that a density depends on
     edges_m: Float[Tensor, "rays edges"],
     density_bias: float,
     left: float = 0.0,
+    fog: float = 0.0,
 ) -> Float[Tensor, "rays bins"]:
     """Density per metre in the middle of each bin; zero beyond where at most `left` of a ray is left.
+
+    What is thinner than `fog` counts as nothing.
 
     `boxes` are centroids, centres and half sizes (sub-fields, 3) of the sub-fields, field frame, metres. The network
     has one hidden layer; its first output is the density's logarithm, less `density_bias`.
@@ -64,8 +67,7 @@ def ray_density(  # noqa: PLR0913, PLR0917 - all that a density depends on
         _arrays(*boxes),
         _arrays(grid.table, grid.offsets, grid.levels),
         _layers(network),
-        np.float32(density_bias),
-        np.float32(most),
+        (np.float32(density_bias), np.float32(most), np.float32(fog)),
         stage,
         density.numpy(),
         numba.get_num_threads(),
@@ -90,7 +92,7 @@ def _layers(network: SubFieldMlp) -> tuple[np.ndarray, ...]:
 
 # Numba's cache sees changes of this file only: after one of `encode_rows`, touch it.
 @numba.njit(parallel=True, cache=True, error_model="numpy", fastmath=FAST)
-def _fill(rays, boxes, grid, layers, density_bias, most, stage, density, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
+def _fill(rays, boxes, grid, layers, limits, stage, density, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
     """Workers take equal shares of the rays."""
     ray_count = len(density)
     share = (ray_count + worker_count - 1) // worker_count
@@ -100,12 +102,13 @@ def _fill(rays, boxes, grid, layers, density_bias, most, stage, density, worker_
         end = min((worker + 1) * share, ray_count)
         for first in range(worker * share, end, step):
             last = min(first + step, end)
-            _follow(rays, first, last, boxes, grid, layers, density_bias, most, stage, density, work)
+            _follow(rays, first, last, boxes, grid, layers, limits, stage, density, work)
 
 
 @numba.njit(error_model="numpy")
-def _follow(rays, first, last, boxes, grid, layers, density_bias, most, stage, density, work):  # noqa: PLR0913, PLR0917 - likewise
+def _follow(rays, first, last, boxes, grid, layers, limits, stage, density, work):  # noqa: PLR0913, PLR0917 - likewise
     """Rays first..last through a stage after the other, as long as less than `most` optical depth is behind them."""
+    density_bias, most, fog = limits
     followed = np.arange(first, last)
     optical = np.zeros(len(followed), np.float32)
     for low in range(0, density.shape[1], stage):
@@ -113,7 +116,7 @@ def _follow(rays, first, last, boxes, grid, layers, density_bias, most, stage, d
         _place(rays, followed, low, high, boxes, work)
         _encode(grid, work)
         _infer(layers, work)
-        _note(rays[2], followed, low, high, density_bias, work, density, optical)
+        _note(rays[2], followed, low, high, density_bias, fog, work, density, optical)
         unfinished = optical < most
         followed, optical = followed[unfinished], optical[unfinished]
 
@@ -268,7 +271,7 @@ def _multiply_add(builder, first, second, total):
 
 
 @numba.njit(fastmath=FAST)
-def _note(edges_m, followed, low, high, density_bias, work, density, optical):  # noqa: PLR0913, PLR0917 - likewise
+def _note(edges_m, followed, low, high, density_bias, fog, work, density, optical):  # noqa: PLR0913, PLR0917 - likewise
     """Write the densities of samples low..high of the followed rays, and add to their optical depths."""
     _, row, _, inside, _, output, _, _ = work
     n = 0
@@ -277,5 +280,6 @@ def _note(edges_m, followed, low, high, density_bias, work, density, optical):  
             i = row[n]
             n += 1
             value = math.exp(min(output[i] + density_bias, MOST)) if inside[i] else np.float32(0)
+            value = np.float32(0) if value < fog else value
             density[ray, bin] = value
             optical[number] += value * (edges_m[ray, bin + 1] - edges_m[ray, bin])

@@ -39,15 +39,17 @@ def find_surface(
     directions_world: NDArray[np.float64],
     surface: Literal["first-hit", "expected"],
     with_features: bool = True,
+    fog_density: float = 0.0,
 ) -> SurfacePoints:
     """Surface points of rays with world origins (R, 3), metres, and unit directions (R, 3).
 
-    first-hit: where the summed weight passes one half. expected: at the mean depth of the weight.
+    first-hit: where the summed weight passes one half. expected: at the mean depth of the weight. What is thinner than
+    `fog_density`, per metre, has no weight.
     Features (of no channel, if they are not wanted), colour and density are those of the field at that very point.
     """
     count = max(1, -(-len(origins_world) // CHUNK_RAYS))
     parts = zip(np.array_split(origins_world, count), np.array_split(directions_world, count), strict=True)
-    chunks = [_surface_of_chunk(field, *rays, surface, with_features) for rays in parts]
+    chunks = [_surface_of_chunk(field, *rays, surface, with_features, fog_density) for rays in parts]
     columns = {
         column.name: np.concatenate([getattr(chunk, column.name) for chunk in chunks])
         for column in fields(SurfacePoints)
@@ -57,10 +59,10 @@ def find_surface(
 
 @torch.no_grad()
 def _surface_of_chunk(
-    field: TileField, origins_world: NDArray, directions_world: NDArray, surface: str, with_features: bool
+    field: TileField, origins_world: NDArray, directions_world: NDArray, surface: str, with_features: bool, fog: float
 ) -> SurfacePoints:
     rays = field.rays(origins_world, directions_world)
-    depth, found = _depth(field, rays, surface)
+    depth, found = _depth(field, rays, surface, fog)
     points = (rays.origins + depth[:, None] * rays.directions)[:, None]
     values = field.query(points, field.conditions(rays), with_features)
     density = torch.stack([values.density, *field.proposal_densities(points)]).mean(0)
@@ -75,12 +77,12 @@ def _surface_of_chunk(
     )
 
 
-def _depth(field: TileField, rays: Rays, surface: str) -> tuple[Tensor, Tensor]:
+def _depth(field: TileField, rays: Rays, surface: str, fog: float) -> tuple[Tensor, Tensor]:
     """Depth (R,) of the surface along each ray, and whether there is one."""
     _, edges = field.place_samples(rays, Sampling(left=UNSEEN))
     edges_m = field.spacing(rays).metres(edges)
     if surface == "expected":
-        weights = field.weights(rays, edges_m, UNSEEN)
+        weights = field.weights(rays, edges_m, UNSEEN, fog)
         _, found = rendering.first_hit(weights)
         return rendering.expected_depth(weights, (edges_m[:, 1:] + edges_m[:, :-1]) / 2), found
-    return rendering.first_hit_depth(field.weights(rays, edges_m, HIT), edges_m)
+    return rendering.first_hit_depth(field.weights(rays, edges_m, HIT, fog), edges_m)

@@ -286,10 +286,13 @@ class TileField(nn.Module):
         )
 
     def weights(
-        self, rays: Rays, edges_m: Float[Tensor, "rays edges"], left: float = 0.0
+        self, rays: Rays, edges_m: Float[Tensor, "rays edges"], left: float = 0.0, fog: float = 0.0
     ) -> Float[Tensor, "rays bins"]:
-        """Share of each ray that ends between its edges; nothing beyond where at most `left` of the ray is left."""
-        return self._weights(self.trunk, rays, edges_m, left)
+        """Share of each ray that ends between its edges; nothing beyond where at most `left` of the ray is left.
+
+        Rays go through what is thinner than `fog`, per metre, as if it were nothing.
+        """
+        return self._weights(self.trunk, rays, edges_m, left, fog)
 
     def density(self, points: Float[Tensor, "rays samples 3"]) -> Float[Tensor, "rays samples"]:
         """Density per metre at points."""
@@ -309,17 +312,19 @@ class TileField(nn.Module):
         ]
         return torch.cat([spherical_harmonics(rays.directions), *embeddings], -1)
 
-    def _weights(self, network: DensityNetwork, rays: Rays, edges_m: Tensor, left: float) -> Tensor:
+    def _weights(self, network: DensityNetwork, rays: Rays, edges_m: Tensor, left: float, fog: float = 0.0) -> Tensor:
         if ray_density.suits(network.grid, edges_m):
-            density = self._ray_density(network, rays, edges_m, left)
+            density = self._ray_density(network, rays, edges_m, left, fog)
             return rendering.ray_weights(density, edges_m.diff(dim=-1))
         if left:
-            return weights_until(lambda points: self._density(network, points), rays, edges_m, left)
+            return weights_until(lambda points: self._density(network, points), rays, edges_m, left, fog)
         return rendering.ray_weights(self._density(network, rays.points(edges_m)), edges_m.diff(dim=-1))
 
-    def _ray_density(self, network: DensityNetwork, rays: Rays, edges_m: Tensor, left: float) -> Tensor:
+    def _ray_density(
+        self, network: DensityNetwork, rays: Rays, edges_m: Tensor, left: float, fog: float = 0.0
+    ) -> Tensor:
         boxes, bias = (self.centroids, self.box_centre, self.box_half), self.shape.settings.density_bias
-        return ray_density.ray_density(network.grid, network.network, boxes, rays, edges_m, bias, left)
+        return ray_density.ray_density(network.grid, network.network, boxes, rays, edges_m, bias, left, fog)
 
     def _density(self, network: DensityNetwork, points: Tensor) -> Tensor:
         if ray_density.suits(network.grid, points):

@@ -67,6 +67,23 @@ def test_rays_end_where_they_are_followed_no_further(left):
     assert 0.1 < (density == 0).float().mean() < 0.9
 
 
+def test_fog_is_nothing_to_a_ray_in_one_pass_and_operator_after_operator():
+    field, left = field_of(2), 0.3
+    with torch.no_grad():
+        field.trunk.network.biases[-1][:, 0] += 2
+    rays, edges_m = rays_and_edges(field, bins=64)
+    whole = along(field, field.trunk, rays, edges_m)
+    fog = float(whole.median())
+    with torch.no_grad():
+        density = field._ray_density(field.trunk, rays, edges_m, left, fog)
+        expected = weights_until(lambda points: field._density(field.trunk, points), rays, edges_m, left, fog)
+        through = field.weights(rays, edges_m, left, fog)
+    torch.testing.assert_close(through, expected, rtol=1e-3, atol=1e-5)
+    assert not ((density > 0) & (density < fog)).any()
+    assert bool((density[density > 0] == whole[density > 0]).all())
+    assert (density[:, 16:] > 0).sum() > (along(field, field.trunk, rays, edges_m, left)[:, 16:] >= fog).sum()
+
+
 def test_a_ray_is_the_same_alone_and_whatever_the_number_of_threads():
     field = field_of(2)
     rays, edges_m = rays_and_edges(field)

@@ -47,8 +47,16 @@ class Wall(TileField):
     def _density(self, network, points):
         return torch.where(points[..., 0] + self.origin_m[0] > EAST_M + 8, 50.0, 0.0)
 
-    def _ray_density(self, network, rays, edges_m, left):
-        return self._density(network, rays.points(edges_m))
+    def _ray_density(self, network, rays, edges_m, left, fog):
+        density = self._density(network, rays.points(edges_m))
+        return torch.where(density < fog, 0, density)
+
+
+class FoggyWall(Wall):
+    """The same, with fog before it in which every other ray would end."""
+
+    def _density(self, network, points):
+        return super()._density(network, points).clamp_min(0.1)
 
 
 def test_rendering_has_a_row_for_each_ray():
@@ -199,6 +207,14 @@ def test_surface_lies_on_the_wall(surface):
     assert seen.found.tolist() == [True, False]
     assert seen.depth_m[0] == pytest.approx(7, abs=0.25)  # the wall begins inside a sample
     np.testing.assert_allclose(seen.points_world[0], origin[0] + [seen.depth_m[0], 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("surface", ["first-hit", "expected"])
+def test_a_ray_goes_through_fog_if_it_is_told_to(surface):
+    rays = np.array([[EAST_M - 4, 0.2, 0.1]]), np.array([[1.0, 0, 0]])
+    held, through = (find_surface(FoggyWall(small_shape()), *rays, surface, fog_density=fog) for fog in (0, 0.2))
+    assert held.depth_m[0] < 9  # half of a ray is left after 7 m of such fog
+    assert through.depth_m[0] == pytest.approx(12, abs=0.5)
 
 
 def test_surface_density_is_the_mean_of_the_three_networks():

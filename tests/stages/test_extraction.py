@@ -86,7 +86,12 @@ def frame_of(upper: int, lower: int) -> FramePixels:
 
 
 def street_surface(
-    _field, origins: np.ndarray, directions: np.ndarray, surface: str, with_features: bool = True
+    _field,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    surface: str,
+    with_features: bool = True,
+    fog_density: float = 0.0,
 ) -> extraction.SurfacePoints:
     """Where rays meet the ground, or the wall to the left below its roof; what stands behind is never seen."""
     assert surface == "first-hit"
@@ -98,6 +103,8 @@ def street_surface(
     depth = np.minimum(ground_m, wall_m)
     found = np.isfinite(depth)
     points = origins + np.where(found, depth, 1.0)[:, None] * directions
+    density = np.where(points[:, 0] > THIN_M, 0.01, 3.0).astype(np.float32)
+    found &= density >= fog_density  # beyond the thin part there is nothing
     features = np.stack([points[:, 0] / 40, wall_m < ground_m, np.full(len(points), 0.5), found], -1)
     return extraction.SurfacePoints(
         found,
@@ -105,7 +112,7 @@ def street_surface(
         points,
         features.astype(np.float32) if with_features else np.zeros((len(points), 0), np.float32),
         np.full((len(points), 3), 0.2, np.float32),
-        np.where(points[:, 0] > THIN_M, 0.01, 3.0).astype(np.float32),
+        density,
     )
 
 
@@ -218,6 +225,14 @@ def test_voxels_can_have_the_features_of_the_images_that_saw_them(tmp_path: Path
     is_left = voxels_of(batches)[:, 1] >= 0
     assert 0 < is_left.sum() < len(features)
     assert (features == np.where(is_left, LEFT, RIGHT)[:, None]).all()
+
+
+def test_rays_go_through_fog(tmp_path: Path):
+    clear = CITY.model_copy(update={"extraction": CITY.extraction.model_copy(update={"fog_density": 0.02})})
+    held, through = (extracted(job_of(street_frames(), city=city), tmp_path)[0].counts for city in (CITY, clear))
+    assert held["density"] > through["density"] == 0
+    assert through["no_surface"] > held["no_surface"]
+    assert through["voxels"] == held["voxels"]
 
 
 def test_batches_are_sorted_and_valid(tmp_path: Path):

@@ -80,20 +80,6 @@ def test_means_equal_those_of_a_plain_loop(tmp_path: Path, memory_rows: int):
         assert stored["density"] == pytest.approx(mean["density"], rel=1e-3)
 
 
-def test_dense_voxels_need_one_hit_only(tmp_path: Path):
-    batches = [(samples(400, seed), 0) for seed in range(3)]
-    sums = VoxelSums(LATTICE, CHANNELS, 1, tmp_path)
-    for batch, drive in batches:
-        sums.add(batch, drive)
-    every = plain_means(batches, min_hits=1)
-    lone = float(np.median([mean["density"] for mean in every.values()]))
-    kept, dropped = sums.finish(min_hits=2, lone_density=lone)
-    expected = {voxel for voxel, mean in every.items() if mean["hits"] >= 2 or mean["density"] > lone}
-    assert stored_means(sums).keys() == expected
-    assert (kept, dropped) == (len(expected), len(every) - len(expected))
-    assert len(plain_means(batches, min_hits=2)) < kept < len(every)
-
-
 def test_spilling_changes_no_voxel_and_hardly_a_mean(tmp_path: Path):
     whole, spilling = [
         VoxelSums(LATTICE, CHANNELS, 1, tmp_path / name, rows) for name, rows in (("a", 1 << 19), ("b", 100))
