@@ -221,8 +221,7 @@ def voxel_figures(tile: Tile, field: TileField, picture: Path) -> dict[str, Any]
     best, hits = true_voxels(tile)
     best_m = tile.surface.distance_m(best)
     figures["ceiling_of_hits"] = {
-        least: scores(best[hits >= least], best_m[hits >= least], seen, labels)
-        for least in (1, 2)
+        least: scores(best[hits >= least], best_m[hits >= least], seen, labels) for least in (1, 2)
     }
     return figures
 

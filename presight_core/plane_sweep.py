@@ -23,9 +23,10 @@ from presight_core.semi_global import best_places, floats
 
 CELL_PX = 4  # a depth is found for every fourth pixel of every fourth row
 MIDDLE_PX = CELL_PX // 2 + 0.5  # of a cell: where the middle of that pixel is
-# (13, 2) offsets, the middle in the middle: the black squares of a board of five by five pixels. What is in front
-# grows by half a patch at its edges.
-PATCH_PX = np.mgrid[-2:3, -2:3][::-1].reshape(2, -1).T[::2]
+# (25, 2) offsets, the middle in the middle: the black squares of a board of seven by seven pixels.
+PATCH_PX = np.mgrid[-3:4, -3:4][::-1].reshape(2, -1).T[::2]
+ALIKE = 15.0  # grey levels: what differs so much from the middle, and may lie on something else, counts a third
+LEAST_SHARE = 0.05  # of what the middle counts
 SOURCE_SCALE = 2  # sources are looked at between their pixels, too: in images of so many times their size
 NEAREST_M, FARTHEST_M = 2.5, 150.0  # what is farther than can be told should not be taken for near
 DEPTH_COUNT = 200  # with 134 the middle error is 1.3 times as large beyond 30 m, in 30 % less time
@@ -163,15 +164,24 @@ def _motions(camera: Camera, others: list[Camera]) -> tuple[NDArray[np.float32],
 
 def _patches(
     grey: UInt8[NDArray, "height width"], pixels: Float[NDArray, "cells 2"]
-) -> tuple[Float[NDArray, "cells samples"], NDArray[np.bool_]]:
-    """Grey values around pixels, of mean 0 and length 1, and where they are inside the image and differ."""
+) -> tuple[Float[NDArray, "cells 2 samples"], NDArray[np.bool_]]:
+    """Patches around pixels, and where they are inside the image and differ.
+
+    Of each sample what a source's grey value is multiplied with for their correlation, were that of deviation 1, and
+    its share, which is larger where it is like the middle (Yoon and Kweon, Adaptive support-weight approach, 2006).
+    """
     height, width = grey.shape
     columns, rows = (pixels[:, None] + PATCH_PX).astype(np.int64).transpose(2, 0, 1)
     inside = (columns.min(1) >= 0) & (rows.min(1) >= 0) & (columns.max(1) < width) & (rows.max(1) < height)
     values = grey[rows.clip(0, height - 1), columns.clip(0, width - 1)].astype(np.float32)
-    values -= values.mean(1, keepdims=True)
-    length = np.linalg.norm(values, axis=1)
-    return values / np.maximum(length, 1)[:, None], inside & (length > MIN_CONTRAST * np.sqrt(len(PATCH_PX)))
+    middle = values[:, len(PATCH_PX) // 2, None]
+    shares = np.maximum(np.exp(-np.abs(values - middle) / ALIKE), LEAST_SHARE)
+    shares /= shares.sum(1, keepdims=True)
+    contrast = values.std(1)
+    values -= (shares * values).sum(1, keepdims=True)
+    spread = np.sqrt((shares * values**2).sum(1, keepdims=True))
+    patches = np.stack([shares * values / np.maximum(spread, FLAT**0.5), shares], 1)
+    return patches.astype(np.float32), inside & (contrast > MIN_CONTRAST)
 
 
 def _patch_rays(
@@ -209,7 +219,7 @@ def _slopes(camera: Camera, normals: Float[NDArray, "rows columns 3"]) -> Float[
 def _fill_scores(cells, patches, rays, sources, size_px, turns, shifts, depths_m, first, last, scores, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
     """Fill, for the cells of the list and their depths first..last, how well the best two sources agree (0..1)."""
     for worker in prange(worker_count):
-        seen, room = np.empty((patches.shape[1], 3), np.float32), _room(len(depths_m))
+        seen, room = np.empty((patches.shape[2], 3), np.float32), _room(len(depths_m))
         found, best, second = np.empty((3, len(depths_m)), np.float32)
         for place in range(worker, len(cells), worker_count):
             cell, start, end = cells[place], first[place], last[place]
@@ -265,28 +275,28 @@ def _room(count):
 
 @numba.njit(fastmath=True)
 def _correlate(patch, seen, shift, image, size_px, depths_m, room, found):  # noqa: PLR0913, PLR0917 - numba wants arrays
-    """Fill found (D,): the correlation of a patch of mean 0 and length 1 with a source's grey values.
+    """Fill found (D,): the correlation of a patch with a source's grey values.
 
     0 where these hardly differ, -1 where the patch is not wholly inside the source.
     """
     total, squares, common, outside, at, grey = room
-    size, count = np.float32(len(patch)), len(depths_m)
+    count = len(depths_m)
     for depth in range(count):
         total[depth] = squares[depth] = common[depth] = 0
         outside[depth] = -1
-    for i in range(len(patch)):
+    for i in range(patch.shape[1]):
         _project(seen[i], shift, size_px, depths_m, at, outside)
         for depth in range(count):
             grey[depth] = image[np.uint32(at[depth])]
-        weight = patch[i]
+        weight, share = patch[0, i], patch[1, i]
         for depth in range(count):
             value = np.float32(grey[depth])
-            total[depth] += value
-            squares[depth] += value * value
+            total[depth] += value * share
+            squares[depth] += value * value * share
             common[depth] += value * weight
     for depth in range(count):
-        spread = squares[depth] - total[depth] * total[depth] / size
-        alike = common[depth] / np.sqrt(spread) if spread > FLAT * size else np.float32(0)
+        spread = squares[depth] - total[depth] * total[depth]
+        alike = common[depth] / np.sqrt(spread) if spread > FLAT else np.float32(0)
         found[depth] = alike if outside[depth] < 0 else np.float32(-1)
 
 
