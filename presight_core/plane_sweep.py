@@ -167,8 +167,9 @@ def _patches(
 ) -> tuple[Float[NDArray, "cells 2 samples"], NDArray[np.bool_]]:
     """Patches around pixels, and where they are inside the image and differ.
 
-    Of each sample what a source's grey value is multiplied with for their correlation, were that of deviation 1, and
-    its share, which is larger where it is like the middle (Yoon and Kweon, Adaptive support-weight approach, 2006).
+    A patch holds two numbers of each sample: the weight with which grey values of a source, whose deviation is 1, add
+    up to their correlation with the patch, and the sample's share of all means, which is larger where its grey value is
+    like that of the middle (Yoon and Kweon, Adaptive support-weight approach for correspondence search, 2006).
     """
     height, width = grey.shape
     columns, rows = (pixels[:, None] + PATCH_PX).astype(np.int64).transpose(2, 0, 1)
