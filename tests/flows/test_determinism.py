@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 CITY = "singapore-onenorth"
 OVERRIDES = (
     *TINY, "training.steps=60", "training.checkpoint_every=5",
-    "tiling.tile_count=4", "tiling.sub_field_count=1", "extraction.min_hits=1", "extraction.min_density=0.0",
+    "tiling.tile_count=4", "tiling.sub_field_count=1", "extraction.fog_density=0.0", "extraction.min_density=0.0",
     "extraction.max_depth_m=900.0", "extraction.below_camera_m=500.0", "extraction.above_camera_m=500.0",
     "extraction.pixel_stride=16", "validation.min_voxels=1", "validation.min_psnr_db=1.0",
 )  # fmt: skip

@@ -41,7 +41,7 @@ def test_a_current_city_has_no_reasons(city):
 
 def test_a_changed_setting_is_named_with_both_values(city):
     assert reasons(plan_of(city, "training.steps=77")) == {("setting", "setting training.steps: 1200 -> 77")}
-    assert reasons(plan_of(city, "extraction.min_hits=3")) == {("setting", "setting extraction.min_hits: 2 -> 3")}
+    assert reasons(plan_of(city, "extraction.min_hits=3")) == {("setting", "setting extraction.min_hits: 1 -> 3")}
 
 
 @pytest.mark.parametrize("stage", ["features", "training", "extraction"])
