@@ -14,7 +14,7 @@ from presight_core.drives import FrameTable
 from presight_core.field.surface import find_surface
 from presight_core.field.tile_field import TileField
 from presight_core.frames import planar_transform
-from presight_core.pixels import FramePixels
+from presight_core.pixels import FramePixels, PixelSource
 from presight_core.tiles import SubField
 from stages.card_training import EAGER_STEPS, CardRun
 from stages.training import TileTraining
@@ -23,7 +23,7 @@ CHANNELS = 64  # paper
 STREET_M = 400.0
 
 
-class Noise:
+class Noise(PixelSource):
     """Images of noise in the shape of the paper's: the cost of a step does not depend on what they show."""
 
     def __init__(self, bench: Bench) -> None:

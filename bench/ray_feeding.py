@@ -19,7 +19,7 @@ from presight_core.config import load_city_settings
 from presight_core.drives import FrameTable
 from presight_core.field import threads
 from presight_core.frames import planar_transform
-from presight_core.pixels import FramePixels
+from presight_core.pixels import FramePixels, PixelSource
 from stages.feeding import POOL_STEPS, Feed
 from stages.tiling import sub_fields
 from stages.training import TileTraining, training_rows
@@ -29,7 +29,7 @@ FEATURE_ROWS, FEATURE_COLUMNS, CHANNELS = 72, 128, 64  # DINO at stride 8 of 576
 STREET_M = 2000.0
 
 
-class JpegSource:
+class JpegSource(PixelSource):
     """The same street in every image, decoded anew."""
 
     def __init__(self) -> None:

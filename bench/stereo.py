@@ -75,7 +75,7 @@ def _told(tile: BenchTile, rows: NDArray[np.int64], known: KnownDepths) -> tuple
         true, camera = scene.rays(row, STRIDE_PX), frames.camera_of(row)
         size_px = camera.width_px, camera.height_px
         pixels = pixel_centres(*size_px, STRIDE_PX)
-        seen = tile.source.load(row).labels
+        _, seen = tile.source.load_view(row)
         directions = torch.from_numpy(true.directions.astype(np.float32))
         rays = Rays(torch.zeros_like(directions), directions, None, torch.full((len(directions),), image))
         ends_m = known.along(rays, torch.from_numpy(seen[cell_of(pixels, size_px, seen.shape)]))[:, 0]
@@ -105,7 +105,8 @@ def _draw(tile: BenchTile, rows: NDArray[np.int64], found_m: NDArray, true_m: ND
     """Some images, what is known of them, and the truth."""
     strips = []
     for image in np.linspace(0, len(rows) - 1, PICTURE_ROWS).astype(int).tolist():
-        rgb = tile.source.load(int(rows[image])).rgb[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX]
+        rgb, _ = tile.source.load_view(int(rows[image]))
+        rgb = rgb[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX]
         depths = (np.where(depth_m > 0, depth_m, np.inf) for depth_m in (found_m[image], true_m[image]))
         strips.append([rgb, *(pictures.depth_image(depth_m) for depth_m in depths)])
     pictures.save_png(file, pictures.stack_rows(strips, ("image", "known depth", "true depth"), 225))

@@ -31,6 +31,11 @@ class PixelSource(Protocol):
         """Decode one row. Raises InputError if the image cannot be read."""
         ...
 
+    def load_view(self, row: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Pixels and labels of `load`. A source that keeps features apart need not decode them."""
+        pixels = self.load(row)
+        return pixels.rgb, pixels.labels
+
 
 def cell_of(
     pixels: NDArray[np.float64], image_size_px: tuple[int, int], grid: tuple[int, ...]

@@ -1,51 +1,35 @@
 """How far the surfaces of an image are, told from images of the same things taken nearby: a plane sweep.
 
 Around a pixel a small patch of surface is put at one distance after the other (Collins, A space-sweep approach to true
-multi-image matching, 1996). Where it is right, the other images show the patch as the first one does, whatever the
-exposure: the correlation of their grey values is near 1. Which distance is taken depends on the cells around, too
-(`semi_global`). Then patches are laid into the planes that the cells around them lie in, and looked at again. Nothing
-is learned, and poses must be known.
+multi-image matching, 1996). Where it is right, the other images show the patch as the first one does (`patch_scores`).
+Which distance is taken depends on the cells around, too (`semi_global`). Then patches are laid into the planes that the
+cells around them lie in, and looked at again.
+
+That is done in images of half the size, where patches hold more and are mistaken less often, and then once more near
+what was found there. Nothing is learned, and poses must be known.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
-from numba import prange
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 
 from presight_core.cameras import Camera, pixel_centres
-from presight_core.images import enlarged
 from presight_core.local_planes import planes_around
-from presight_core.semi_global import best_places, floats
+from presight_core.patch_scores import PatchScores, View
+from presight_core.semi_global import best_places
 
 CELL_PX = 4  # a depth is found for every fourth pixel of every fourth row
 MIDDLE_PX = CELL_PX // 2 + 0.5  # of a cell: where the middle of that pixel is
-# (25, 2) offsets, the middle in the middle: the black squares of a board of seven by seven pixels.
-PATCH_PX = np.mgrid[-3:4, -3:4][::-1].reshape(2, -1).T[::2]
-ALIKE = 15.0  # grey levels: what differs so much from the middle, and may lie on something else, counts a third
-LEAST_SHARE = 0.05  # of what the middle counts
-SOURCE_SCALE = 2  # sources are looked at between their pixels, too: in images of so many times their size
 NEAREST_M, FARTHEST_M = 2.5, 150.0  # what is farther than can be told should not be taken for near
 DEPTH_COUNT = 200  # with 134 the middle error is 1.3 times as large beyond 30 m, in 30 % less time
 NEARNESS = np.linspace(1 / NEAREST_M, 1 / FARTHEST_M, DEPTH_COUNT)  # 1 / depth, at even steps
-MIN_CONTRAST = 2.0  # grey levels, standard deviation in a patch: flatter ones match anything
-REACH_M = np.float32(0.5)  # nearer to a source's image plane than this nothing is looked for
-TURNS = 2  # how often patches are laid anew
-NEAR_STEPS = 10  # depths to each side of the one found before that a patch laid anew is put at
-FLAT = np.float32(0.05)  # grey levels, squared: sources that differ less than that show nothing
-MAX_TILT = 2.0  # a patch is at most so many times nearer or farther at its rim than at its centre
+ROUGH_NEARNESS = NEARNESS[::2]  # in images of half the size
+MARGIN = 12  # depths beyond those that were found there in the cells around
+NEAR = 8  # depths to each side of the one found before that a patch laid anew is put at
 MAX_SLOPE = 0.5  # of the nearness of a cell: what grows more to the next is seen edge-on
-
-
-@dataclass(frozen=True)
-class View:
-    """A grey image, and its camera, which counts in the image's own pixels."""
-
-    grey: UInt8[NDArray, "height width"]
-    camera: Camera
 
 
 @dataclass(frozen=True)
@@ -56,6 +40,21 @@ class Cells:
     is_known: Bool[NDArray, "rows columns"]  # False: the normal is a first guess
     labels: UInt8[NDArray, "rows columns"]  # where they differ, a surface seldom goes on
 
+    def halved(self, shape: tuple[int, int]) -> "Cells":
+        """The cells of the image in half the size: one of four."""
+        rows, columns = (np.minimum(2 * np.arange(n) + 1, m - 1) for n, m in zip(shape, self.labels.shape, strict=True))
+        chosen = np.ix_(rows, columns)
+        return Cells(self.normals[chosen], self.is_known[chosen], self.labels[chosen])
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """What was found in the cells of an image."""
+
+    nearness: Float[NDArray, "rows columns"]  # 1 / depth in their middles; NaN: unknown
+    normals: Float[NDArray, "rows columns 3"]  # like those of `Cells`
+    labels: UInt8[NDArray, "rows columns"]
+
 
 def sweep(reference: View, cells: Cells, sources: Sequence[View]) -> Float[NDArray, "rows columns 3"]:
     """The plane in every cell that explains the sources best: 1 / depth at its middle, and how much more it is beside.
@@ -63,59 +62,13 @@ def sweep(reference: View, cells: Cells, sources: Sequence[View]) -> Float[NDArr
     Depths are along the optical axis, metres; beside are the next cells to the right and below. 0 where nothing is
     known. There must be two sources at least, all of one size.
     """
-    volume, normals = _Volume(reference, cells, sources), cells.normals
-    volume.score(normals, ~np.zeros_like(cells.is_known))
-    places = volume.best_places(normals)
-    for _ in range(TURNS):
-        normals, is_new = _turned(reference.camera, cells, places)
-        volume.score(normals, is_new, places)
-        places = volume.best_places(normals)
-    nearness = np.nan_to_num(_nearness(places))[..., None]
-    return nearness * np.concatenate([np.ones_like(nearness), _slopes(reference.camera, normals)], -1)
-
-
-class _Volume:
-    """How well each depth suits each cell."""
-
-    def __init__(self, reference: View, cells: Cells, sources: Sequence[View]) -> None:
-        sources = [_enlarged(source) for source in sources]
-        self._camera, self._labels = reference.camera, cells.labels
-        self._pixels = pixel_centres(self._camera.width_px, self._camera.height_px, CELL_PX)
-        self._motions = _motions(self._camera, [source.camera for source in sources])
-        self._patches, self._has_contrast = _patches(reference.grey, self._pixels)
-        self._sources = np.stack([source.grey.ravel() for source in sources])
-        self._size_px = np.array(sources[0].grey.shape[::-1], np.int32)
-        self._scores = np.zeros((len(self._pixels), DEPTH_COUNT), np.float32)
-
-    def score(
-        self,
-        normals: Float[NDArray, "rows columns 3"],
-        chosen: Bool[NDArray, "rows columns"],
-        places: Float[NDArray, "rows columns"] | None = None,
-    ) -> None:
-        """Look at patches with the normals in the chosen cells, at all depths or those near the given ones."""
-        normals = normals.reshape(-1, 3)
-        cells = np.flatnonzero(self._has_contrast & normals.any(-1) & chosen.ravel())
-        middle = np.zeros(len(cells)) if places is None else np.nan_to_num(places.ravel()[cells])
-        reach = DEPTH_COUNT if places is None else NEAR_STEPS
-        _fill_scores(
-            cells,
-            self._patches,
-            _patch_rays(self._camera, self._pixels[cells], normals[cells]),
-            self._sources,
-            self._size_px,
-            *self._motions,
-            (1 / NEARNESS).astype(np.float32),
-            (middle - reach).clip(0, DEPTH_COUNT).astype(np.int32),
-            (middle + reach).clip(0, DEPTH_COUNT).astype(np.int32),
-            self._scores,
-            numba.get_num_threads(),
-        )
-
-    def best_places(self, normals: Float[NDArray, "rows columns 3"]) -> Float[NDArray, "rows columns"]:
-        """Which depths suit the cells and those around them; NaN where nothing is known."""
-        volume = self._scores.reshape(*self._labels.shape, DEPTH_COUNT)
-        return best_places(volume, _planes(self._camera, normals), self._labels, NEARNESS)
+    small = _halved(reference)
+    few = cells.halved(grid_shape(small.camera.width_px, small.camera.height_px))
+    everywhere = np.broadcast_to((0, len(ROUGH_NEARNESS)), (*few.labels.shape, 2))
+    rough = _Search(small, few, [_halved(source) for source in sources], ROUGH_NEARNESS).run(few.normals, everywhere)
+    found = _Search(reference, cells, sources, NEARNESS).run(*_near(rough, cells))
+    nearness = np.nan_to_num(found.nearness)[..., None]
+    return nearness * np.concatenate([np.ones_like(nearness), _slopes(reference.camera, found.normals)], -1)
 
 
 def grid_shape(width_px: int, height_px: int) -> tuple[int, int]:
@@ -124,82 +77,85 @@ def grid_shape(width_px: int, height_px: int) -> tuple[int, int]:
     return rows, columns
 
 
-def _nearness(places: Float[NDArray, "rows columns"]) -> Float[NDArray, "rows columns"]:
-    """1 / depth of places between the depths that are looked at."""
-    return np.interp(places, np.arange(DEPTH_COUNT), NEARNESS)
+def _halved(view: View) -> View:
+    """In half the size, but a cell at least."""
+    width_px, height_px = (max(CELL_PX, size // 2) for size in (view.camera.width_px, view.camera.height_px))
+    return view.resized(width_px, height_px)
+
+
+class _Search:
+    """Looks for the surfaces of an image at depths given by 1 / depth."""
+
+    def __init__(
+        self, reference: View, cells: Cells, sources: Sequence[View], nearness: Float[NDArray, " depths"]
+    ) -> None:
+        self._camera, self._cells, self._nearness = reference.camera, cells, nearness
+        pixels = pixel_centres(self._camera.width_px, self._camera.height_px, CELL_PX)
+        self._scores = PatchScores(reference, pixels, sources, 1 / nearness)
+
+    def run(self, normals: Float[NDArray, "rows columns 3"], reach: Int[NDArray, "rows columns 2"]) -> _Surfaces:
+        """What is found within reach by patches with the normals, then by such as lie in the planes around them."""
+        self._scores.look(normals.reshape(-1, 3), reach.reshape(-1, 2))
+        nearness = self._best(normals, reach)
+        normals, is_new = _turned(self._camera, self._cells, nearness)
+        known = np.nan_to_num(nearness)
+        beside = _reach(known, known, NEAR, self._nearness)
+        self._scores.look(np.where(is_new[..., None], normals, 0).reshape(-1, 3), beside.reshape(-1, 2))
+        return _Surfaces(self._best(normals, reach), normals, self._cells.labels)
+
+    def _best(
+        self, normals: Float[NDArray, "rows columns 3"], reach: Int[NDArray, "rows columns 2"]
+    ) -> Float[NDArray, "rows columns"]:
+        """1 / depth that suits the cells and those around them; NaN where nothing is known."""
+        labels = self._cells.labels
+        volume = self._scores.values.reshape(*labels.shape, -1)
+        places = best_places(volume, reach, _planes(self._camera, normals), labels, self._nearness)
+        return np.interp(places, np.arange(len(self._nearness)), self._nearness)
+
+
+def _near(rough: _Surfaces, cells: Cells) -> tuple[Float[NDArray, "rows columns 3"], Int[NDArray, "rows columns 2"]]:
+    """Normals of what was found in the image of half the size, and the depths near it; all, where nothing was.
+
+    What is too narrow for that image, so that no cell there has its label, may be anywhere.
+    """
+    shapes = zip(cells.labels.shape, rough.labels.shape, strict=True)
+    rows, columns = (np.minimum(np.arange(count) // 2, few - 1) for count, few in shapes)
+    around = [np.ix_(rows + down, columns + right) for down, right in np.ndindex(3, 3)]
+    nearness, labels = (
+        np.stack([np.pad(values, 1, mode="edge")[place] for place in around])
+        for values in (np.nan_to_num(rough.nearness), rough.labels)
+    )
+    nearest = nearness.max(0)
+    farthest = np.where(nearness > 0, nearness, nearest).min(0)
+    is_known = ((labels == cells.labels) & (nearness > 0)).any(0)
+    reach = np.where(is_known[..., None], _reach(nearest, farthest, MARGIN, NEARNESS), (0, DEPTH_COUNT))
+    is_alike = labels[len(around) // 2] == cells.labels
+    return np.where(is_alike[..., None], rough.normals[np.ix_(rows, columns)], cells.normals), reach
+
+
+def _reach(
+    nearest: Float[NDArray, "rows columns"],
+    farthest: Float[NDArray, "rows columns"],
+    margin: int,
+    nearness: Float[NDArray, " depths"],
+) -> Int[NDArray, "rows columns 2"]:
+    """From which depth to before which there are depths between two, and a margin; all are given as 1 / depth."""
+    step = nearness[0] - nearness[1]
+    first, last = ((nearness[0] - end) / step for end in (nearest, farthest))
+    return np.stack([first - margin, last + margin + 1], -1).clip(0, len(nearness)).astype(np.int64)
 
 
 def _turned(
-    camera: Camera, cells: Cells, places: Float[NDArray, "rows columns"]
+    camera: Camera, cells: Cells, nearness: Float[NDArray, "rows columns"]
 ) -> tuple[Float[NDArray, "rows columns 3"], Bool[NDArray, "rows columns"]]:
     """Normals of the planes that the cells around each cell lie in, and where there is such a plane.
 
     Elsewhere, and where they are known, normals stay.
     """
-    planes = planes_around(np.nan_to_num(_nearness(places)).astype(np.float32), cells.labels)
+    planes = planes_around(np.nan_to_num(nearness).astype(np.float32), cells.labels)
     is_new = planes.any(-1) & cells.normals.any(-1) & ~cells.is_known
     normals = planes @ np.linalg.inv(_pixel_from_cell()) @ camera.intrinsics
     return np.where(is_new[..., None], normals, cells.normals), is_new
-
-
-def _pixel_from_cell() -> NDArray[np.float64]:
-    """Takes a cell's column and row to the pixel in its middle, homogeneous."""
-    return np.array([[CELL_PX, 0, MIDDLE_PX], [0, CELL_PX, MIDDLE_PX], [0, 0, 1]])
-
-
-def _enlarged(view: View) -> View:
-    grey = enlarged(view.grey, SOURCE_SCALE)
-    height_px, width_px = grey.shape
-    return View(grey, view.camera.scaled(width_px, height_px))
-
-
-def _motions(camera: Camera, others: list[Camera]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What takes points (3,) of the camera to homogeneous pixels of others: turns (K, 3, 3) and shifts (K, 3)."""
-    world_from_camera = np.stack([other.world_from_camera for other in others])
-    pixel_from_world = np.stack([other.intrinsics for other in others]) @ world_from_camera[:, :3, :3].swapaxes(1, 2)
-    offsets = camera.world_from_camera[:3, 3] - world_from_camera[:, :3, 3]
-    turns = pixel_from_world @ camera.world_from_camera[:3, :3]
-    return turns.astype(np.float32), np.einsum("kij,kj->ki", pixel_from_world, offsets).astype(np.float32)
-
-
-def _patches(
-    grey: UInt8[NDArray, "height width"], pixels: Float[NDArray, "cells 2"]
-) -> tuple[Float[NDArray, "cells 2 samples"], NDArray[np.bool_]]:
-    """Patches around pixels, and where they are inside the image and differ.
-
-    A patch holds two numbers of each sample: the weight with which grey values of a source, whose deviation is 1, add
-    up to their correlation with the patch, and the sample's share of all means, which is larger where its grey value is
-    like that of the middle (Yoon and Kweon, Adaptive support-weight approach for correspondence search, 2006).
-    """
-    height, width = grey.shape
-    columns, rows = (pixels[:, None] + PATCH_PX).astype(np.int64).transpose(2, 0, 1)
-    inside = (columns.min(1) >= 0) & (rows.min(1) >= 0) & (columns.max(1) < width) & (rows.max(1) < height)
-    values = grey[rows.clip(0, height - 1), columns.clip(0, width - 1)].astype(np.float32)
-    middle = values[:, len(PATCH_PX) // 2, None]
-    shares = np.maximum(np.exp(-np.abs(values - middle) / ALIKE), LEAST_SHARE)
-    shares /= shares.sum(1, keepdims=True)
-    contrast = values.std(1)
-    values -= (shares * values).sum(1, keepdims=True)
-    spread = np.sqrt((shares * values**2).sum(1, keepdims=True))
-    patches = np.stack([shares * values / np.maximum(spread, FLAT**0.5), shares], 1)
-    return patches.astype(np.float32), inside & (contrast > MIN_CONTRAST)
-
-
-def _patch_rays(
-    camera: Camera, pixels: Float[NDArray, "cells 2"], normals: Float[NDArray, "cells 3"]
-) -> Float[NDArray, "cells samples 3"]:
-    """Points of a patch whose centre is at depth 1, in the camera's axes: all on a plane with the normal.
-
-    At another depth the patch has the same form, only larger.
-    """
-    homogeneous = np.concatenate([pixels[:, None] + PATCH_PX, np.ones((len(pixels), len(PATCH_PX), 1))], -1)
-    rays = homogeneous @ np.linalg.inv(camera.intrinsics).T
-    away = np.einsum("nsi,ni->ns", rays, normals)
-    middle = away[:, len(PATCH_PX) // 2, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        tilt = np.nan_to_num(middle / away, nan=1.0)
-    tilt[(tilt <= 0).any(1)] = 1  # a plane that the camera is in: take the patch for one that faces it
-    return (rays * tilt.clip(1 / MAX_TILT, MAX_TILT)[..., None]).astype(np.float32)
 
 
 def _planes(camera: Camera, normals: Float[NDArray, "rows columns 3"]) -> Float[NDArray, "rows columns 3"]:
@@ -216,100 +172,6 @@ def _slopes(camera: Camera, normals: Float[NDArray, "rows columns 3"]) -> Float[
     return slopes.clip(-MAX_SLOPE, MAX_SLOPE)
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
-def _fill_scores(cells, patches, rays, sources, size_px, turns, shifts, depths_m, first, last, scores, worker_count):  # noqa: PLR0913, PLR0917 - numba wants arrays
-    """Fill, for the cells of the list and their depths first..last, how well the best two sources agree (0..1)."""
-    for worker in prange(worker_count):
-        seen, room = np.empty((patches.shape[2], 3), np.float32), _room(len(depths_m))
-        found, best, second = np.empty((3, len(depths_m)), np.float32)
-        for place in range(worker, len(cells), worker_count):
-            cell, start, end = cells[place], first[place], last[place]
-            best[start:end] = second[start:end] = -1
-            for source in range(len(turns)):
-                shift, image = shifts[source], sources[source]
-                _turn(rays[place], turns[source], seen)
-                low, high = _shown(seen[len(seen) // 2], shift, size_px, depths_m, start, end)
-                _correlate(patches[cell], seen, shift, image, size_px, depths_m[low:high], room, found[low:high])
-                for depth in range(low, high):
-                    second[depth] = max(second[depth], min(best[depth], found[depth]))
-                    best[depth] = max(best[depth], found[depth])
-            for depth in range(start, end):  # what hides the patch from others does not count
-                scores[cell, depth] = max(best[depth] + second[depth], np.float32(0)) / 2
-
-
-@numba.njit(fastmath=True)
-def _turn(rays, turn, seen):
-    """Fill seen (S, 3): the patch in a source's homogeneous pixels, the shift aside."""
-    for i in range(len(rays)):
-        for axis in range(3):
-            seen[i, axis] = turn[axis, 0] * rays[i, 0] + turn[axis, 1] * rays[i, 1] + turn[axis, 2] * rays[i, 2]
-
-
-@numba.njit(fastmath=True)
-def _shown(point, shift, size_px, depths_m, start, end):
-    """Of the depths start..end those at which a source's image holds a point: a stretch, for they lie on a line."""
-    while start < end and not _is_inside(point, shift, size_px, depths_m[start]):
-        start += 1
-    while start < end and not _is_inside(point, shift, size_px, depths_m[end - 1]):
-        end -= 1
-    return start, end
-
-
-@numba.njit(fastmath=True)
-def _is_inside(point, shift, size_px, depth_m):
-    x, y, away_m = depth_m * point[0] + shift[0], depth_m * point[1] + shift[1], depth_m * point[2] + shift[2]
-    return away_m >= REACH_M and 0 <= x <= size_px[0] * away_m and 0 <= y <= size_px[1] * away_m
-
-
-@numba.njit
-def _room(count):
-    """What `_correlate` notes at each depth: three sums, how far outside the patch is, a point's place and its grey.
-
-    Six arrays, for only then the compiler sees that they lie apart, and takes many depths together.
-    """
-    a, b, c, d = floats(count), floats(count), floats(count), floats(count)
-    return a, b, c, d, np.empty(count, np.int32), np.empty(count, np.uint8)
-
-
-# Below, vector instructions take many depths of a point together: each loop does one thing, so that they can.
-
-
-@numba.njit(fastmath=True)
-def _correlate(patch, seen, shift, image, size_px, depths_m, room, found):  # noqa: PLR0913, PLR0917 - numba wants arrays
-    """Fill found (D,): the correlation of a patch with a source's grey values.
-
-    0 where these hardly differ, -1 where the patch is not wholly inside the source.
-    """
-    total, squares, common, outside, at, grey = room
-    count = len(depths_m)
-    for depth in range(count):
-        total[depth] = squares[depth] = common[depth] = 0
-        outside[depth] = -1
-    for i in range(patch.shape[1]):
-        _project(seen[i], shift, size_px, depths_m, at, outside)
-        for depth in range(count):
-            grey[depth] = image[np.uint32(at[depth])]
-        weight, share = patch[0, i], patch[1, i]
-        for depth in range(count):
-            value = np.float32(grey[depth])
-            total[depth] += value * share
-            squares[depth] += value * value * share
-            common[depth] += value * weight
-    for depth in range(count):
-        spread = squares[depth] - total[depth] * total[depth]
-        alike = common[depth] / np.sqrt(spread) if spread > FLAT else np.float32(0)
-        found[depth] = alike if outside[depth] < 0 else np.float32(-1)
-
-
-@numba.njit(fastmath=True)
-def _project(point, shift, size_px, depths_m, at, outside):
-    """Fill at (D,): a point in a source, pixels counted row by row. Beyond the rim outside (D,) becomes 0 or more."""
-    (a, b, c), (u, v, w) = (point[0], point[1], point[2]), (shift[0], shift[1], shift[2])
-    stride, width, height = size_px[0], np.float32(size_px[0]), np.float32(size_px[1])
-    zero, one = np.float32(0), np.float32(1)
-    for depth in range(len(depths_m)):
-        scale = one / max(depths_m[depth] * c + w, REACH_M)
-        x, y = (depths_m[depth] * a + u) * scale, (depths_m[depth] * b + v) * scale
-        outside[depth] = max(outside[depth], -x, x - width, -y, y - height)
-        column, row = np.int32(min(max(x, zero), width - one)), np.int32(min(max(y, zero), height - one))
-        at[depth] = row * stride + column
+def _pixel_from_cell() -> NDArray[np.float64]:
+    """Takes a cell's column and row to the pixel in its middle, homogeneous."""
+    return np.array([[CELL_PX, 0, MIDDLE_PX], [0, CELL_PX, MIDDLE_PX], [0, 0, 1]])

@@ -8,7 +8,7 @@ little, and leave it for more. So what is plain is filled from what has a patter
 
 import numba
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 
 STEP_COST, LEAP_COST = np.float32(0.3), np.float32(1.4)  # in units of correlation
@@ -25,30 +25,45 @@ FLAT = 1e-3  # all depths cost the same: nothing is known
 
 def best_places(
     scores: Float[NDArray, "rows columns depths"],
+    reach: Int[NDArray, "rows columns 2"],
     planes: Float[NDArray, "rows columns 3"],
     labels: UInt8[NDArray, "rows columns"],
     nearness: Float[NDArray, " depths"],
 ) -> Float[NDArray, "rows columns"]:
     """The index, with a fraction, of each cell's depth; NaN where nothing is known.
 
-    `scores` (0..1) say how well each depth suits a cell. A plane (a, b, c) says that on the cell's surface 1 / depth is
-    proportional to a * column + b * row + c; cells whose plane is 0 are left out, and no path crosses them. `nearness`
-    is 1 / depth, at even steps.
+    `scores` (0..1) say how well each depth suits a cell. Only depths from the first number of `reach` to before the
+    second count, two at least. A plane (a, b, c) says that on the cell's surface 1 / depth is proportional to
+    a * column + b * row + c; cells whose plane is 0 are left out, and no path crosses them. `nearness` is 1 / depth, at
+    even steps.
     """
     scores, planes, costs = scores.astype(np.float32), planes.astype(np.float32), np.zeros(scores.shape, np.float32)
     for side in (1, -1):
-        _add_paths(scores, planes, labels, nearness.astype(np.float32), side, costs)
-    chosen = costs.argmin(-1)
-    middle = chosen.clip(1, len(nearness) - 2)
-    before, least, after = (np.take_along_axis(costs, (middle + i)[..., None], -1)[..., 0] for i in (-1, 0, 1))
-    bend = before - 2 * least + after
-    inside = (chosen == middle) & (bend > 0)
-    places = chosen + np.where(inside, (before - after) / (2 * np.where(inside, bend, 1)), 0)  # the foot of a parabola
-    return np.where(planes.any(-1) & (np.ptp(costs, -1) > FLAT), places, np.nan)
+        _add_paths(scores, reach, planes, labels, nearness.astype(np.float32), side, costs)
+    return _cheapest(costs, reach, planes)
+
+
+@numba.njit(cache=True)
+def _cheapest(costs, reach, planes):
+    """Where the costs of each cell are least, between depths at the foot of a parabola."""
+    places = np.full(planes.shape[:2], np.nan)
+    for row in range(planes.shape[0]):
+        for column in range(planes.shape[1]):
+            first, end = reach[row, column]
+            cost = costs[row, column, first:end]
+            least = cost.argmin()
+            if not planes[row, column].any() or cost.max() - cost[least] <= FLAT:
+                continue
+            places[row, column] = first + least
+            if 0 < least < len(cost) - 1:
+                before, after = cost[least - 1], cost[least + 1]
+                bend = before - 2 * cost[least] + after
+                places[row, column] += (before - after) / (2 * bend) if bend > 0 else 0
+    return places
 
 
 @numba.njit(fastmath=ANY_ORDER_OF_LEAST, cache=True)
-def _add_paths(scores, planes, labels, nearness, side, costs):
+def _add_paths(scores, reach, planes, labels, nearness, side, costs):  # noqa: PLR0913, PLR0917 - numba wants arrays
     """Add what the cheapest path costs that ends in a cell at a depth, more than at the best depth, for four paths.
 
     `side` is 1 for the paths that come from above or the left, -1 for those from below or the right. Of each path only
@@ -56,7 +71,7 @@ def _add_paths(scores, planes, labels, nearness, side, costs):
     """
     rows, columns, depths = scores.shape
     paths = np.empty((len(BEFORE), 2, columns, depths), np.float32)
-    own, room = np.empty(depths, np.float32), _room(depths)
+    values, room = np.empty(depths, np.float32), _room(depths)
     first_place = nearness[0] / (nearness[1] - nearness[0])  # depths from where nearness is 0 to the first one
     for i in range(rows):
         row = i if side > 0 else rows - 1 - i
@@ -64,15 +79,19 @@ def _add_paths(scores, planes, labels, nearness, side, costs):
             column = j if side > 0 else columns - 1 - j
             if not planes[row, column].any():
                 continue
+            first, end = reach[row, column]
+            own = values[first:end]
             for path in range(len(BEFORE)):
                 above, left = row + side * BEFORE[path, 0], column + side * BEFORE[path, 1]
-                for depth in range(depths):
-                    own[depth] = np.float32(1) - scores[row, column, depth]
+                for depth in range(len(own)):
+                    own[depth] = np.float32(1) - scores[row, column, first + depth]
                 if 0 <= above < rows and 0 <= left < columns and planes[above, left].any():
                     ratio = _ratio(planes[row, column], row, column, (above, left))
                     share = np.float32(1) if labels[above, left] == labels[row, column] else AT_BORDERS
-                    _go_on(paths[path, above % 2, left], ratio, share, first_place, room, own)
-                _settle(own, paths[path, row % 2, column], costs[row, column])
+                    low, high = reach[above, left]
+                    place = first_place * (ratio - np.float32(1)) + np.float32(first) * ratio - np.float32(low)
+                    _go_on(paths[path, above % 2, left, low:high], place, ratio, share, room, own)
+                _settle(own, paths[path, row % 2, column, first:end], costs[row, column, first:end])
 
 
 @numba.njit(fastmath=ANY_ORDER_OF_LEAST)
@@ -120,23 +139,18 @@ def floats(count):
 
 
 @numba.njit(fastmath=ANY_ORDER_OF_LEAST)
-def _go_on(before, ratio, share, first_place, room, own):
+def _go_on(before, first_place, ratio, share, room, own):
     """Add to each depth's own cost the cheapest way to it from the cell before; `share` of the costs of leaving.
 
-    What is at a depth here is `ratio` as near in the cell before. Vector instructions take many depths together:
-    each loop does one thing, so that they can.
+    What is at a depth here is `ratio` as near in the cell before: the first at the place `first_place` there. Vector
+    instructions take many depths together: each loop does one thing, so that they can.
     """
     places, fractions, beside, lower, upper, around = room
-    last, start, half = np.int32(len(before) - 1), first_place * (ratio - np.float32(1)), np.float32(0.5)
+    last, half = np.int32(len(before) - 1), np.float32(0.5)
     step, leap = share * STEP_COST, share * LEAP_COST
     _fill_beside(before, beside)
-    if ratio == 1:  # most cells face the camera at first: spared two of three loops
-        for depth in range(last):
-            own[depth] += min(before[depth], beside[depth] + step, leap)
-        own[last] += min(before[last], beside[last - 1] + step, leap)
-        return
     for depth in range(len(own)):
-        place = start + np.float32(depth) * ratio
+        place = first_place + np.float32(depth) * ratio
         places[depth] = min(max(np.int32(place), np.int32(0)), last - np.int32(1))
         fractions[depth] = place - np.float32(places[depth])
     for depth in range(len(own)):

@@ -21,8 +21,9 @@ from presight_core.cameras import Camera, pixel_centres
 from presight_core.drives import FrameTable
 from presight_core.field.rays import Rays
 from presight_core.images import grey_level, resized
+from presight_core.patch_scores import View
 from presight_core.pixels import PixelSource, cell_of
-from presight_core.plane_sweep import CELL_PX, MIDDLE_PX, Cells, View, grid_shape, sweep
+from presight_core.plane_sweep import CELL_PX, MIDDLE_PX, Cells, grid_shape, sweep
 from presight_core.progress import Progress, Report, silent
 from stages.neighbours import Neighbours
 
@@ -150,13 +151,13 @@ class _Comparison:
 
     def _load(self, image: int) -> tuple[View, Cells]:
         """A small grey image, and what labels tell of its cells."""
-        camera, pixels = self._cameras[image], self._images.source.load(int(self._images.rows[image]))
+        camera, (rgb, seen) = self._cameras[image], self._images.source.load_view(int(self._images.rows[image]))
         size_px = camera.width_px, camera.height_px
-        labels = pixels.labels[cell_of(pixel_centres(*size_px, CELL_PX), size_px, pixels.labels.shape)]
+        labels = seen[cell_of(pixel_centres(*size_px, CELL_PX), size_px, seen.shape)]
         normals = np.where(LEVEL[labels][:, None], camera.world_from_camera[2, :3], (0.0, 0.0, 1.0))
         normals[NOWHERE[labels]] = 0
         shape = grid_shape(*size_px)
-        view = View(grey_level(resized(pixels.rgb, *size_px)), camera)
+        view = View(grey_level(resized(rgb, *size_px)), camera)
         return view, Cells(normals.reshape(*shape, 3), LEVEL[labels].reshape(shape), labels.reshape(shape))
 
 

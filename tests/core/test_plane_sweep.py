@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from presight_core.cameras import Camera
-from presight_core.plane_sweep import CELL_PX, Cells, View, grid_shape, sweep
+from presight_core.cameras import Camera, pixel_centres
+from presight_core.patch_scores import View
+from presight_core.plane_sweep import CELL_PX, Cells, grid_shape, sweep
 from tests.patterned_scene import FOCAL, GROUND, HEIGHT, WIDTH, Plane, camera_at, depth_m, picture, wall
 
 REFERENCE = camera_at(0, 0)
@@ -82,6 +83,22 @@ def test_the_exposure_of_other_images_does_not_matter():
     assert np.abs(found / 9.0 - 1).mean() < 0.03  # 0.4 as many grey levels tell it less exactly
 
 
+def with_post(camera: Camera) -> tuple[View, np.ndarray]:
+    """A post 4 m ahead, 6 pixels wide, before a wall 9 m ahead; and which pixels (H, W) show it."""
+    origin, directions = camera.rays(pixel_centres(WIDTH, HEIGHT))
+    beside_m = origin[1] + wall(4.0).distance_m(camera) * directions[:, 1]
+    is_post = (np.abs(beside_m + 0.1) < 0.14).reshape(HEIGHT, WIDTH)
+    return View(np.where(is_post, picture(camera, wall(4.0)), picture(camera, wall(9.0))), camera), is_post
+
+
+def test_what_is_too_narrow_for_small_images_is_found_nevertheless():
+    reference, is_post = with_post(REFERENCE)
+    labels = is_post[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX].astype(np.uint8)
+    found = depths_of(reference, replace(FACING, labels=labels), [with_post(camera)[0] for camera in BESIDE])
+    assert not labels[1::2, 1::2].any()
+    assert (np.abs(found[INNER][labels[INNER] > 0] / 4.0 - 1) < 0.05).mean() > 0.8
+
+
 def test_two_images_that_see_the_place_are_enough():
     random = np.random.default_rng(1)
     hidden = [View(random.integers(0, 255, (HEIGHT, WIDTH), np.uint8), camera) for camera in BESIDE[:2]]
@@ -119,3 +136,17 @@ def test_the_result_does_not_depend_on_the_number_of_threads(monkeypatch):
         monkeypatch.setattr("numba.get_num_threads", lambda count=count: count)
         results.append(sweep(*given))
     np.testing.assert_array_equal(*results)
+
+
+def test_images_of_a_few_pixels_are_no_trouble():
+    small = [
+        View(each.grey[:6, :9], Camera(each.camera.intrinsics, each.camera.world_from_camera, 9, 6))
+        for each in views(BESIDE, wall(9.0))
+    ]
+    shape = grid_shape(9, 6)
+    cells = Cells(
+        FACING.normals[: shape[0], : shape[1]],
+        FACING.is_known[: shape[0], : shape[1]],
+        FACING.labels[: shape[0], : shape[1]],
+    )
+    assert not sweep(small[0], cells, small[1:]).any()

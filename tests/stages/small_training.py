@@ -6,7 +6,7 @@ from presight_core import classes
 from presight_core.config import CitySettings, load_city_settings
 from presight_core.drives import FrameTable
 from presight_core.frames import planar_transform
-from presight_core.pixels import FramePixels
+from presight_core.pixels import FramePixels, PixelSource
 from presight_core.tiles import SubField
 from stages.training import TileTraining
 
@@ -26,7 +26,7 @@ EGO_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 
 SIZE = (24, 16)
 
 
-class Gradient:
+class Gradient(PixelSource):
     """Images whose upper half is sky, whose lower half is road, and whose left column is a car."""
 
     def load(self, row: int) -> FramePixels:

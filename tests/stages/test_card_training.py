@@ -12,7 +12,7 @@ from presight_core.errors import InputError
 from presight_core.field.checkpoint import load_field
 from presight_core.field.tile_field import Rays
 from presight_core.frames import planar_transform
-from presight_core.pixels import FramePixels
+from presight_core.pixels import FramePixels, PixelSource
 from presight_core.tiles import SubField
 from stages import card_pool, card_training
 from stages.card_ground import CardGround
@@ -33,7 +33,7 @@ SUB_FIELDS = (
 )
 
 
-class Numbered:
+class Numbered(PixelSource):
     """Images whose colours tell the image, the column and the row; a car covers ever more columns of them."""
 
     def load(self, row: int) -> FramePixels:

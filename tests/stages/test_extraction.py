@@ -13,7 +13,7 @@ from presight_core.config import CitySettings
 from presight_core.drives import FrameTable
 from presight_core.errors import InputError
 from presight_core.grid import Lattice, morton
-from presight_core.pixels import FramePixels
+from presight_core.pixels import FramePixels, PixelSource
 from presight_core.priors import PriorReader
 from presight_core.priors.documents import GenerationTile
 from presight_core.priors.schema import array_specs, check_batch, unpack_columns, unpack_voxels
@@ -64,7 +64,7 @@ def street_frames(count: int = 6, drives: tuple[str, ...] = ("drive-b", "drive-a
     return FrameTable.concatenate(tables)
 
 
-class StreetPixels:
+class StreetPixels(PixelSource):
     """Labels of every frame: sky in the top quarter, a car in the lower left corner, else road.
 
     Features are one value left of the middle, and another one right of it.

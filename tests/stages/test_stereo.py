@@ -10,7 +10,7 @@ from presight_core import classes
 from presight_core.drives import FrameTable
 from presight_core.errors import InputError
 from presight_core.field.rays import Rays
-from presight_core.pixels import FramePixels
+from presight_core.pixels import FramePixels, PixelSource
 from presight_core.plane_sweep import CELL_PX
 from presight_core.progress import Progress
 from stages import stereo
@@ -28,7 +28,7 @@ CAR = classes.CITYSCAPES.index("car")
 BUILDING = classes.CITYSCAPES.index("building")
 
 
-class Street:
+class Street(PixelSource):
     """Its pictures. The wall's left part is a car, so far as labels can tell."""
 
     def __init__(self, frames: FrameTable) -> None:

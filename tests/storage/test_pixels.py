@@ -61,6 +61,13 @@ def test_a_choice_of_frames_keeps_each_frames_own_layers(frames, cache, tmp_path
         assert pixels.features.max() == frame
 
 
+def test_views_are_what_is_loaded_without_features(frames, cache, tmp_path):
+    source = pixels_of(frames, tmp_path, cache)
+    rgb, labels = source.load_view(3)
+    np.testing.assert_array_equal(rgb, source.load(3).rgb)
+    np.testing.assert_array_equal(labels, source.load(3).labels)
+
+
 def test_images_shrink_to_the_scale_and_layers_do_not(frames, cache, tmp_path):
     pixels = pixels_of(frames, tmp_path, cache, 0.5).load(0)
     assert pixels.rgb.shape == (10, 20, 3)
