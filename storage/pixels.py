@@ -41,16 +41,19 @@ class CachedPixels(PixelSource):
 
     def load_view(self, row: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Pixels and labels of `load`, at a fraction of its cost."""
-        labels = self._cache.read_labels(self._key, str(self._frames.drive_id[row]), int(self._cache_rows[row]))
+        labels = self._read_labels(row)
         rgb = self._load_rgb(row)
         return rgb, masked_labels(labels, rgb, self._settings.features)
 
     def load_labels(self, row: int) -> NDArray[np.uint8]:
         """The labels of `load` alone, at a fraction of its cost where masks need no image."""
-        labels = self._cache.read_labels(self._key, str(self._frames.drive_id[row]), int(self._cache_rows[row]))
+        labels = self._read_labels(row)
         needs_image = self._settings.features.mask_shadows
         rgb = self._load_rgb(row) if needs_image else np.zeros((1, 1, 3), np.uint8)
         return masked_labels(labels, rgb, self._settings.features)
+
+    def _read_labels(self, row: int) -> NDArray[np.uint8]:
+        return self._cache.read_labels(self._key, str(self._frames.drive_id[row]), int(self._cache_rows[row]))
 
     def _load_rgb(self, row: int) -> NDArray[np.uint8]:
         frames = self._frames
