@@ -4,5 +4,5 @@ A raised number makes every tile built with the old one stale.
 """
 
 FEATURES = 2
-TRAINING = 10
+TRAINING = 11
 EXTRACTION = 2

@@ -11,10 +11,11 @@ LARGEST_EXPONENT = 15.0  # Instant-NGP's bound of the gradient; 1 cm of such a d
 
 
 class TruncatedExponential(torch.autograd.Function):
-    """exp(x), truncated at both ends of its gradient and at the upper end of its value.
+    """exp(x), truncated at the upper end of its value; beyond -15..15 its gradient only leads back there.
 
-    What lies behind a surface gets gradients that are next to nothing, and Adam makes whole steps of them: there x
-    wanders, in some thousand steps beyond the 88 of which float32 knows the exponential.
+    What lies behind a surface, or where nothing is, gets gradients that are next to nothing, and Adam makes whole steps
+    of them: there x wanders, upwards beyond the 88 of which float32 knows the exponential, downwards by thousands, and
+    takes the network's weights along (docs/decisions/031).
     """
 
     @staticmethod
@@ -25,11 +26,12 @@ class TruncatedExponential(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
-        return gradients[0] * x.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).exp()
+        gradient = gradients[0] * x.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).exp()
+        return torch.where((x.abs() <= LARGEST_EXPONENT) | (x * gradient > 0), gradient, 0)
 
 
 def truncated_exponential(x: Tensor) -> Tensor:
-    """exp(x) with x clamped to at most 15, and the gradient's exponent to -15..15."""
+    """exp(x) with x clamped to at most 15; the gradient's exponent is clamped to -15..15, and leads no farther away."""
     return TruncatedExponential.apply(x)  # type: ignore[return-value]
 
 

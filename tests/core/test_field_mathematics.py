@@ -130,6 +130,23 @@ def test_truncated_exponential_has_a_bounded_gradient():
     torch.testing.assert_close(x.grad, torch.tensor([1.0, 15.0]).exp())
 
 
+def test_a_density_beyond_its_bounds_learns_only_what_leads_back():
+    x = torch.tensor([-20.0, -20.0, 20.0, 20.0], requires_grad=True)
+    rendering.truncated_exponential(x).backward(torch.tensor([1.0, -1.0, 1.0, -1.0]))
+    assert x.grad is not None
+    torch.testing.assert_close(x.grad, torch.tensor([0.0, -15.0, 15.0, 0.0]).exp() * torch.tensor([0, -1, 1, 0]))
+
+
+def test_what_should_be_empty_does_not_run_away_in_a_long_training():
+    x = torch.full((1,), -14.0, requires_grad=True)
+    optimiser = torch.optim.AdamW([x], lr=0.1, eps=1e-15, weight_decay=0.0)
+    for _ in range(1000):
+        rendering.truncated_exponential(x).sum().backward()
+        optimiser.step()
+        optimiser.zero_grad()
+    assert -17 < x.item() < -15  # a gradient that goes on beyond -15 takes it to -110
+
+
 def random_histogram(bins: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     edges = torch.rand(6, bins + 1, generator=generator, dtype=torch.float64).sort(-1).values
