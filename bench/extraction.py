@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from presight_core.field import threads
 from presight_core.field.checkpoint import load_field
-from presight_core.field.surface import find_surface
+from presight_core.field.surface import SurfaceRule, find_surface
 from presight_core.field.tile_field import Sampling, TileField
 from presight_core.grid import Lattice
 from stages.voxel_sums import Samples, VoxelSums
@@ -58,19 +58,25 @@ def speed(field: TileField, rounds: int) -> dict[str, float]:
     origins, directions = random_rays(field, random)
     images = [np.concatenate(rays) for rays in zip(*(image_rays(field, random) for _ in range(IMAGES)), strict=True)]
     numbers, passes = np.zeros(RAYS, np.int64), len(field.proposals) + 1
-    rates: dict[str, list[float]] = {"forward": [], "first-hit": [], "expected": []}
+    rules: tuple[SurfaceRule, ...] = ("first-hit", "expected", "span")
+    rates: dict[str, list[float]] = {name: [] for name in ("forward", *rules)}
     for _ in range(rounds + 1):
         started = time.process_time()
         seen = field(field.rays(origins, directions, numbers, numbers), Sampling(torch.rand(RAYS, passes)))
         rates["forward"].append(RAYS / (time.process_time() - started))
         del seen
-        for rule in ("first-hit", "expected"):
+        for rule in rules:
             started = time.process_time()
-            find_surface(field, *images, rule, with_features=False)
+            find_surface(field, images[0], images[1], rule, with_features=False)
             rates[rule].append(len(images[0]) / (time.process_time() - started))
     medians = {f"{name}_rays_per_s": statistics.median(values[1:]) for name, values in rates.items()}
-    ratios = [surface / forward for surface, forward in zip(rates["first-hit"], rates["forward"], strict=True)]
-    return {**medians, "first_hit_over_forward": statistics.median(ratios[1:])}
+    ratios = {
+        f"{rule}_over_forward": [
+            surface / forward for surface, forward in zip(rates[rule], rates["forward"], strict=True)
+        ]
+        for rule in rules
+    }
+    return {**medians, **{name: statistics.median(values[1:]) for name, values in ratios.items()}}
 
 
 def random_rays(field: TileField, random: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -156,7 +156,7 @@ class TrainingSettings(Settings):
 class ExtractionSettings(Settings):
     """How a trained field becomes voxels."""
 
-    surface: Literal["first-hit", "expected"] = "first-hit"  # paper: first-hit; released code: expected depth
+    surface: Literal["first-hit", "expected", "span"] = "first-hit"  # paper: first-hit; released code: expected depth
     features: Literal["field", "images"] = "field"  # of voxels; paper: what the field says there (docs/decisions/016)
     frame_stride: Count = 8  # every n-th training frame of a camera
     pixel_stride: Count = 5

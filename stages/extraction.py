@@ -88,7 +88,8 @@ def extract_tile(
     counts: Counter[str] = Counter()
     rows = chosen_rows(job)
     followed = _followed(job, field, rows, source, counts)
-    for done, (row, rays, surface) in enumerate(followed, 1):
+    for done, (row, met, middles) in enumerate(followed, 1):
+        rays, surface = _both_ends(job.lattice, met, middles)
         kept = _filtered(job, surface, heights, counts)
         columns.add(rays.origin, _seen_ends(job, rays, surface, kept, heights))
         samples = Samples(surface.points_world, surface.features, surface.rgb, surface.density).select(kept)
@@ -165,6 +166,24 @@ def _found(job: TileExtraction, rays: Rays, surface: SurfacePoints, counts: Coun
     counts["no_surface"] += int((~found).sum())
     rays, surface = Rays(rays.origin, rays.directions[found], rays.features[found]), surface.select(found)
     return rays, replace(surface, features=rays.features / np.float32(255)) if of_images else surface
+
+
+def _both_ends(lattice: Lattice, rays: Rays, surface: SurfacePoints) -> tuple[Rays, SurfacePoints]:
+    """Each ray twice: to where its surface begins, and to where it ends; once, to the middle, if a voxel holds both.
+
+    So a voxel counts the rays that hit it.
+    """
+    half_m = surface.half_span_m.astype(np.float64)
+    begins, ends = (surface.points_world + side * half_m[:, None] * rays.directions for side in (-1, 1))
+    is_long = (lattice.voxel_of(begins) != lattice.voxel_of(ends)).any(-1)
+    of_ray = np.concatenate([np.arange(len(half_m)), np.flatnonzero(is_long)])
+    shift_m = np.concatenate([-half_m * is_long, half_m[is_long]])
+    rays, surface = Rays(rays.origin, rays.directions[of_ray], rays.features[of_ray]), surface.select(of_ray)
+    return rays, replace(
+        surface,
+        depth_m=(surface.depth_m + shift_m).astype(np.float32),
+        points_world=surface.points_world + shift_m[:, None] * rays.directions,
+    )
 
 
 def _filtered(

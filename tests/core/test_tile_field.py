@@ -55,8 +55,16 @@ class Wall(TileField):
 class FoggyWall(Wall):
     """The same, with fog before it in which every other ray would end."""
 
+    fog = 0.1
+
     def _density(self, network, points):
-        return super()._density(network, points).clamp_min(0.1)
+        return super()._density(network, points).clamp_min(self.fog)
+
+
+class HazyWall(FoggyWall):
+    """With haze in which one of seven rays ends in 8 m."""
+
+    fog = 0.02
 
 
 def test_rendering_has_a_row_for_each_ray():
@@ -199,7 +207,7 @@ def test_a_truncated_field_is_refused(tmp_path):
         load_field(tmp_path)
 
 
-@pytest.mark.parametrize("surface", ["first-hit", "expected"])
+@pytest.mark.parametrize("surface", ["first-hit", "expected", "span"])
 def test_surface_lies_on_the_wall(surface):
     wall = Wall(small_shape())
     origin = np.array([[EAST_M + 1, 0.2, 0.1], [EAST_M + 1, 0.2, 0.1]])
@@ -209,12 +217,36 @@ def test_surface_lies_on_the_wall(surface):
     np.testing.assert_allclose(seen.points_world[0], origin[0] + [seen.depth_m[0], 0, 0], atol=1e-6)
 
 
-@pytest.mark.parametrize("surface", ["first-hit", "expected"])
+@pytest.mark.parametrize("surface", ["first-hit", "expected", "span"])
 def test_a_ray_goes_through_fog_if_it_is_told_to(surface):
     rays = np.array([[EAST_M - 4, 0.2, 0.1]]), np.array([[1.0, 0, 0]])
     held, through = (find_surface(FoggyWall(small_shape()), *rays, surface, fog_density=fog) for fog in (0, 0.2))
     assert held.depth_m[0] < 9  # half of a ray is left after 7 m of such fog
     assert through.depth_m[0] == pytest.approx(12, abs=0.5)
+
+
+def test_a_span_begins_and_ends_in_the_wall():
+    rays = np.array([[EAST_M + 1, 0.2, 0.1]]), np.array([[1.0, 0, 0]])
+    seen = find_surface(Wall(small_shape()), *rays, "span")
+    assert seen.found.all()
+    begin_m, end_m = seen.depth_m - seen.half_span_m, seen.depth_m + seen.half_span_m
+    assert 6.75 < begin_m[0] < end_m[0] < 7.75  # the wall, of 50 per metre, begins inside a sample
+    assert not find_surface(Wall(small_shape()), *rays, "first-hit").half_span_m.any()
+
+
+def test_a_ray_that_has_not_decided_where_it_ends_has_no_span():
+    rays = np.array([[EAST_M - 4, 0.2, 0.1]]), np.array([[1.0, 0, 0]])
+    undecided, through = (find_surface(FoggyWall(small_shape()), *rays, "span", fog_density=fog) for fog in (0, 0.2))
+    assert not undecided.found.any()
+    assert through.found.all()
+
+
+def test_a_ray_of_which_most_ends_on_a_short_way_hits_once_there():
+    rays = np.array([[EAST_M, 0.2, 0.1]]), np.array([[1.0, 0, 0]])
+    seen = find_surface(HazyWall(small_shape()), *rays, "span")
+    assert seen.found.all()
+    assert seen.depth_m[0] == pytest.approx(8, abs=0.25)
+    assert not seen.half_span_m.any()
 
 
 def test_surface_density_is_the_mean_of_the_three_networks():

@@ -1,5 +1,6 @@
 """Extraction from a made-up field: a street between a wall and open ground, known by formula."""
 
+import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,7 @@ GROUND_M, WALL_M, ROOF_M = 0.1, 6.1, 5.0  # ground height; the wall's y, and its
 EYE_M = 1.6
 CHANNELS = 4
 LEFT, RIGHT = 51, 204  # features of the images' halves
+SPAN_M = 0.5  # more than a voxel
 THIN_M = 12.0  # beyond this x the field is foggy: density below the filter
 CITY = CitySettings.model_validate(
     {
@@ -93,8 +95,10 @@ def street_surface(
     with_features: bool = True,
     fog_density: float = 0.0,
 ) -> extraction.SurfacePoints:
-    """Where rays meet the ground, or the wall to the left below its roof; what stands behind is never seen."""
-    assert surface == "first-hit"
+    """Where rays meet the ground, or the wall to the left below its roof; what stands behind is never seen.
+
+    If spans are asked for, all are SPAN_M long.
+    """
     with np.errstate(divide="ignore"):
         ground_m = (GROUND_M - origins[:, 2]) / directions[:, 2]
         wall_m = (WALL_M - origins[:, 1]) / directions[:, 1]
@@ -113,6 +117,7 @@ def street_surface(
         features.astype(np.float32) if with_features else np.zeros((len(points), 0), np.float32),
         np.full((len(points), 3), 0.2, np.float32),
         density,
+        np.full(len(points), SPAN_M / 2 if surface == "span" else 0.0, np.float32),
     )
 
 
@@ -225,6 +230,21 @@ def test_voxels_can_have_the_features_of_the_images_that_saw_them(tmp_path: Path
     is_left = voxels_of(batches)[:, 1] >= 0
     assert 0 < is_left.sum() < len(features)
     assert (features == np.where(is_left, LEFT, RIGHT)[:, None]).all()
+
+
+@pytest.mark.parametrize(("span_m", "least", "most"), [(0.5, 1.8, 2.0), (0.01, 1.0, 1.2)])
+def test_a_ray_marks_both_ends_of_its_surface_but_once_a_voxel_that_holds_both(
+    tmp_path: Path, monkeypatch, span_m: float, least: float, most: float
+):
+    monkeypatch.setattr(sys.modules[__name__], "SPAN_M", span_m)
+    points, lowest = {}, {}
+    for rule in ("first-hit", "span"):
+        city = CITY.model_copy(update={"extraction": CITY.extraction.model_copy(update={"surface": rule})})
+        result, batches = extracted(job_of(street_frames(), city=city), tmp_path / rule)
+        points[rule], lowest[rule] = result.counts["points"], voxels_of(batches)[:, 2].min()
+    assert least < points["span"] / points["first-hit"] <= most
+    assert lowest["first-hit"] == 0
+    assert lowest["span"] == (-1 if span_m == 0.5 else 0)  # the ground lies at 0.1 m
 
 
 def test_rays_go_through_fog(tmp_path: Path):
