@@ -16,7 +16,7 @@ def judge_build(voxel_count: int, metrics: Mapping[str, float], settings: Valida
     if voxel_count < settings.min_voxels:
         problems.append(
             f"{voxel_count} voxels, fewer than validation.min_voxels = {settings.min_voxels}; a field of few steps is "
-            f"thin: raise training.steps, or lower extraction.fog_density"
+            f"thin: raise training.steps, or lower extraction.fog_density and set extraction.surface to first-hit"
         )
     broken = sorted(name for name, value in metrics.items() if not math.isfinite(value))
     if broken:

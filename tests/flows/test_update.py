@@ -30,6 +30,7 @@ log2_rows = 12
 steps = 20
 batch_rays = 128
 [extraction]
+surface = "first-hit"
 fog_density = 0.0
 min_density = 0.0
 max_depth_m = 900.0  # a field of so few steps is a fog with surfaces far away
