@@ -25,7 +25,8 @@ OVERRIDES = (
     *TINY, "training.steps=60", "training.checkpoint_every=5",
     "tiling.tile_count=4", "tiling.sub_field_count=1", "extraction.surface=first-hit", "extraction.fog_density=0.0",
     "extraction.min_density=0.0", "extraction.max_depth_m=900.0", "extraction.below_camera_m=500.0",
-    "extraction.above_camera_m=500.0", "extraction.pixel_stride=16", "validation.min_voxels=1", "validation.min_psnr_db=1.0",
+    "extraction.above_camera_m=500.0", "extraction.pixel_stride=16", "validation.min_voxels=1",
+    "validation.min_psnr_db=1.0",
 )  # fmt: skip
 ENDINGS = (0, 6)  # 6: a field of so few steps may leave a tile without voxels, which is then not published
 PATIENCE_S = 600
