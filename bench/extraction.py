@@ -19,9 +19,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from presight_core.config import SurfaceRule
 from presight_core.field import threads
 from presight_core.field.checkpoint import load_field
-from presight_core.field.surface import SurfaceRule, find_surface
+from presight_core.field.surface import find_surface
 from presight_core.field.tile_field import Sampling, TileField
 from presight_core.grid import Lattice
 from stages.voxel_sums import Samples, VoxelSums

@@ -153,10 +153,13 @@ class TrainingSettings(Settings):
     stereo: StereoSettings = StereoSettings()
 
 
+SurfaceRule = Literal["first-hit", "expected", "span"]  # what they mean: field.surface.find_surface
+
+
 class ExtractionSettings(Settings):
     """How a trained field becomes voxels."""
 
-    surface: Literal["first-hit", "expected", "span"] = "first-hit"  # paper: first-hit; released code: expected depth
+    surface: SurfaceRule = "first-hit"  # paper: first-hit; released code: expected depth
     features: Literal["field", "images"] = "field"  # of voxels; paper: what the field says there (docs/decisions/016)
     frame_stride: Count = 8  # every n-th training frame of a camera
     pixel_stride: Count = 5

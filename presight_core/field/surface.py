@@ -1,13 +1,13 @@
 """The surface a ray meets, and what the field says there (paper, section 3.3)."""
 
 from dataclasses import dataclass, fields
-from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from presight_core.config import SurfaceRule
 from presight_core.field import rendering
 from presight_core.field.rays import Rays
 from presight_core.field.tile_field import Sampling, TileField
@@ -19,9 +19,6 @@ SPAN = (0.05, 0.95)  # of a ray's weight, where a surface begins and where it en
 CORE = (0.2, 0.8)  # of a ray's weight: the most of it
 MAX_LENGTH = 0.1  # of the way to where they begin, of both
 CHUNK_RAYS = 32768  # a call costs as much as some 600 rays
-
-
-SurfaceRule = Literal["first-hit", "expected", "span"]
 
 
 @dataclass(frozen=True)

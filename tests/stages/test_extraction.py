@@ -99,6 +99,7 @@ def street_surface(
 
     If spans are asked for, all are SPAN_M long.
     """
+    assert surface in {"first-hit", "span"}
     with np.errstate(divide="ignore"):
         ground_m = (GROUND_M - origins[:, 2]) / directions[:, 2]
         wall_m = (WALL_M - origins[:, 1]) / directions[:, 1]
